@@ -6,6 +6,7 @@ wrong value, the allowed values and the given value.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from numbers import Integral
 from typing import TypeGuard
 
@@ -46,6 +47,26 @@ class SpecError(MorBenchError, ValueError):
 
     The message names the file, the key and the allowed values.
     """
+
+
+class UnknownNameError(SpecError):
+    """A suite has no dataset or method of this name; the message gives the most similar one.
+
+    Attributes
+    ----------
+    kind : str
+        "datasets" or "methods".
+    name : str
+        The name that was asked for.
+    known : tuple of str
+        The names that exist.
+    """
+
+    def __init__(
+        self, message: str, *, kind: str = "", name: str = "", known: Iterable[str] = ()
+    ) -> None:
+        super().__init__(message)
+        self.kind, self.name, self.known = kind, name, tuple(known)
 
 
 class UnusableClassError(SpecError):

@@ -60,7 +60,9 @@ def markup_of(page: str) -> str:
 
 
 def text_of(page: str) -> str:
-    return " ".join(unescape(re.sub(r"<[^>]*>", " ", markup_of(page))).split())
+    """Return the words of a page, without the signs that keep a figure on one line."""
+    text = unescape(re.sub(r"<[^>]*>", " ", markup_of(page))).replace("\N{WORD JOINER}", "")
+    return " ".join(text.split())
 
 
 def data_of(page: str) -> list[dict[str, Any]]:

@@ -12,11 +12,13 @@ from rich.console import Console
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.report.aligned_lines import Line, aligned_lines
-from mor_bench.report.console_tables import Detail, print_tables
+from mor_bench.report.console_tables import Detail, print_plan, print_tables
 from mor_bench.report.number_format import milliseconds_text, seconds_text
-from mor_bench.report.short_names import renamed, short_names
+from mor_bench.report.short_names import short_names
+from mor_bench.report.verdict_words import in_words
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import TrainedElsewhere
+from mor_bench.runs.plan import Plan, Step
 from tests.report_runs import add_row, tiny
 from tests.synthetic import a_row, synthetic_comparison
 
@@ -88,7 +90,7 @@ def test_six_columns_fit_the_width_and_no_name_is_broken(
     assert max(map(len, uncut)) <= width
     start = next(i for i, line in enumerate(lines) if line.startswith("  configuration"))
     end = next(i for i, line in enumerate(lines) if line.startswith("*: on the Pareto"))
-    assert lines[start].split()[1:] == ["median", "p95", "median", "offline", "qualifies"]
+    assert lines[start].split()[1:] == ["(%)", "(%)", "(ms)", "(core-s)", "qualifies"]
     table = "\n".join(lines[start:end])
     for name in map(str, short_names(made.rows).values()):
         assert re.search(rf"^[* ] {re.escape(name)}( |$)", table, re.MULTILINE), name
@@ -99,7 +101,7 @@ def test_six_columns_fit_the_width_and_no_name_is_broken(
 def test_the_verdict_comes_first_and_is_alone_if_quiet(
     shown: Any, made: Comparison, analysis: dict[str, Any]
 ) -> None:
-    headline = renamed(analysis["verdicts"][0]["headline"], short_names(made.rows))
+    headline = in_words(analysis["verdicts"][0]["headline"], short_names(made.rows))
     assert " · " in headline
     needs, finding = headline.split(". ", 1)
     assert shown(10_000).splitlines()[1:3] == [finding, f"- {needs}."]
@@ -112,7 +114,7 @@ def test_the_verdict_comes_first_and_is_alone_if_quiet(
 def test_doubts_about_the_choice_are_named_and_other_notes_counted(shown: Any) -> None:
     text = shown(80)
     flat = " ".join(text.split())
-    assert re.search(r"^  linear-fem +[\d.]+ % +[\d.]+ % +~[\d.]+ µs", text, re.MULTILINE)
+    assert re.search(r"^  linear-fem +[\d.]+ +[\d.]+ +~[\d.]+ ", text, re.MULTILINE)
     assert "pca-regression-linear · k5: the median error is" in flat
     assert "- 1 of 18 timings was not stable" in flat
     again = text.partition("\n  mor-bench run ")[2].partition("--retime\n")[0]
@@ -167,3 +169,73 @@ def test_columns_align_by_the_width_of_letters() -> None:
         "long name",
         "       3",
     ]
+
+
+def test_each_column_of_figures_has_one_unit_which_its_heading_names(shown: Any) -> None:
+    lines = shown(80, wide=True).splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("  configuration"))
+    end = next(i for i, line in enumerate(lines) if line.startswith("*: on the Pareto"))
+    units = lines[start].split()
+    assert units[1:5] == ["(%)", "(%)", "(ms)", "(core-s)"]
+    assert units.count("(ms)") >= 4
+    assert lines[start - 1].split()[:3] == ["median", "p95", "median"]
+    cells = " ".join(lines[start + 1 : end])
+    assert not re.search(r"\d (µs|ms|s|min|h|%)(?= |$)", cells)
+    assert re.search(r"\d (MB|kB)(?= |$)", cells)  # sizes have readable units
+
+
+def test_the_runner_up_and_loads_beyond_the_training_are_named(
+    made: Comparison, shown: Any, tmp_path: Path
+) -> None:
+    text = " ".join(shown(80).split())
+    assert "- Runner-up (another method): fem · tol 0.1, " in text
+    said = (
+        r"Beyond the training loads, the median relative L2 error of \S+ · k\d+ is [\d.]+ % on 2x"
+    )
+    assert re.search(said, text)
+    quick = tiny(tmp_path)
+    add_row(quick, "pod", {"n_modes": 5}, 0.005, 1.0)
+    stream = io.StringIO()
+    print_tables(quick, Console(file=stream, width=80), analyse(quick, n_resamples=20))
+    quickly = " ".join(stream.getvalue().split())
+    assert (
+        "Errors beyond the training loads were not measured; "
+        "`mor-bench run beam-tiny --profile full` measures them."
+    ) in quickly
+
+
+NAMES = (
+    "a-method-of-another-group [n_modes=20, cubature_tolerance=0.001, sampling=points, seed=12345]",
+    "hpod [n_modes=20, cubature_tolerance=0.001]",
+    "pca-gaussian-process [n_input_modes=10, n_output_modes=40]",
+    "fem",
+)
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_a_plan_breaks_no_name(width: int) -> None:
+    reason = "it needs pip install 'mor-bench[learn]', which brings PyTorch and onnxruntime"
+    steps = [Step("beam-coarse-3-forces", "60 of 60 samples", False, 0.0123, "samples")]
+    steps += [Step("beam-coarse-3-forces", name, False, 4321.0) for name in NAMES]
+    steps += [
+        Step("beam-tiny", "5,000 samples", True, 0.0, "samples"),
+        Step("beam-tiny", f"umesh [channels=8] (left out: {reason})", False, 0.0),
+        Step("beam-tiny", "umesh-small (trained elsewhere)", False, 0.0),
+        Step("beam-tiny", "mine", False, None),
+    ]
+    stream = io.StringIO()
+    print_plan(Plan(steps, []), Console(file=stream, width=width))
+    lines = stream.getvalue().splitlines()
+    for name in (*NAMES, "umesh [channels=8]", "umesh-small", "mine"):
+        assert any(re.match(rf"  {re.escape(name)}($|  )", line) for line in lines), name
+    assert all(len(line) <= width for line in lines if NAMES[0] not in line)
+    flat = " ".join(stream.getvalue().split())
+    for said in (
+        "– beam-coarse-3-forces –",
+        "in the cache",
+        "trained elsewhere",
+        reason,
+        "unknown",
+    ):
+        assert said in flat
+    assert re.search(r"fem +4321\b", stream.getvalue())

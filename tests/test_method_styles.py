@@ -28,6 +28,12 @@ FOREIGN = ("my-method", "a", "b", "Ω", "pod2")
 PINNED = ("#C17829", "#D2822D", "octagon", "8", OTHER)
 """The style of `my-method`: published pictures keep it."""
 
+LEAST_LIGHT, LEAST_DARK = 8.0, 13.5
+"""Least distance in CIE L*a*b* of two shades of a family; those on white are published."""
+
+LEAST_LIGHTNESS = 12.0
+"""Least difference of L* of two shades of a family on a dark background."""
+
 # Machado, Oliveira, Fernandes 2009: full colour blindness, in linear RGB.
 BLIND = {
     "none": np.eye(3),
@@ -91,6 +97,19 @@ def test_families_differ_for_colour_blind_readers(blindness: str) -> None:
     for a, b in combinations(own.values(), 2):
         distance = np.linalg.norm(seen(a.colour, blindness) - seen(b.colour, blindness))
         assert distance > 14, (a.family, b.family)
+
+
+@pytest.mark.parametrize("family", families())
+def test_shades_of_a_family_differ_on_both_backgrounds(family: str) -> None:
+    styles = [style_of(method) for method in families()[family]]
+    for look, least in (("colour", LEAST_LIGHT), ("dark_colour", LEAST_DARK)):
+        for a, b in combinations(dict.fromkeys(getattr(style, look) for style in styles), 2):
+            assert np.linalg.norm(seen(a, "none") - seen(b, "none")) > least, (a, b)
+    for a, b in combinations(dict.fromkeys(style.dark_colour for style in styles), 2):
+        lightness = [seen(colour, "none")[0] for colour in (a, b)]
+        assert abs(lightness[0] - lightness[1]) > LEAST_LIGHTNESS, (a, b)
+    for a, b in combinations(styles, 2):
+        assert a.symbol != b.symbol
 
 
 def test_the_style_of_a_foreign_method_is_stable_and_its_own() -> None:

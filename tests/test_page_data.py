@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import re
+from html import unescape
 from importlib.resources import files
 from pathlib import Path
 
@@ -13,13 +15,14 @@ import pytest
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.report.entries import entries_of, verdict_of
-from mor_bench.report.number_format import joined_units, percent
+from mor_bench.report.number_format import joined_units, number, percent, unbroken
 from mor_bench.report.page import render
 from mor_bench.report.page_index import standings
 from mor_bench.report.page_sections import View
 from mor_bench.report.page_verdict import method_card
 from mor_bench.report.page_worst import worst_cases
 from mor_bench.report.short_names import short_names
+from mor_bench.report.whole_cost import CostLine, Costs
 from mor_bench.results.comparison import Comparison
 from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
 from tests.synthetic import MESH, changed
@@ -151,7 +154,7 @@ def test_the_vendored_scripts_are_those_of_their_packages() -> None:
         assert hashlib.sha256((vendor / name).read_bytes()).hexdigest() == digest
 
 
-def test_the_two_worst_loads_are_told_apart() -> None:
+def test_the_worst_loads_are_told_apart() -> None:
     arrays = {
         "relative_l2": np.array([0.05, 0.002, 0.019]),
         "max_nodal_m": np.array([0.0004, 0.0003, 0.0114]),
@@ -159,7 +162,90 @@ def test_the_two_worst_loads_are_told_apart() -> None:
     }
     middle, relative, absolute = worst_cases(arrays)
     assert middle == "Middle (medians): 1.9 %, 0.4 mm at the worst node, moves 150 mm."
-    assert relative == "Worst relative: 5 % (a small load, moves 7.6 mm)."
-    assert absolute == "Worst absolute: 11.4 mm at a node (1.9 %, moves 460 mm)."
+    assert relative == (
+        "Largest relative L2 error of all test loads: 5 % "
+        "(a small load, test load 0, moves 7.6 mm)."
+    )
+    assert absolute == (
+        "Largest error in mm: 11.4 mm at a node (test load 2, 1.9 %, moves 460 mm)."
+    )
+    bodies = "Largest mean error e, drawn under Deformed bodies: "
+    for e, said in (
+        ([1e-5, 1e-5, 1e-3], "the one with the largest in mm."),
+        ([1e-3, 1e-5, 1e-5], "the one with the largest relative error."),
+        ([1e-5, 1e-3, 1e-5], "test load 1 (0.3 mm at a node, 0.2 %)."),
+    ):
+        assert worst_cases({**arrays, "mean_dof_m": np.array(e)})[3] == bodies + said
     assert worst_cases({"relative_l2": np.ones(3)}) == []
     assert worst_cases({**arrays, "relative_l2": np.array([1.0, np.inf, 0.1])}) == []
+
+
+def test_each_worst_says_which_one_it_is(comparison: Comparison, page: str) -> None:
+    (data,) = data_of(page)
+    row = comparison.row("beam-tiny", data["winner"])
+    arrays = comparison.samples(row)
+    error = arrays["worst_prediction"] - arrays["worst_reference"]
+    drawn = np.linalg.norm(error) / np.linalg.norm(arrays["worst_reference"])
+    nodal = 1e3 * np.linalg.norm(error, axis=1).max()
+    assert row.error is not None
+    largest = percent(row.error.rel_l2_max)
+    assert percent(drawn) != largest
+    text = text_of(page.replace("\N{NO-BREAK SPACE}", " "))
+    assert f"largest relative error: {largest} %" in text  # the card
+    assert (
+        f"pod · r20, the test load with its largest mean error e: {number(nodal)} mm at a node, "
+        f"relative L2 error {percent(drawn)} % (largest of all test loads: {largest} %)." in text
+    )
+    sample = next(s for s in data["bodies"]["samples"] if s["label"] == data["winner"])
+    assert sample["caption"] == unbroken(f"{number(nodal)} mm, {percent(drawn)} %")
+
+
+def test_no_line_of_the_page_breaks_inside_a_figure(page: str) -> None:
+    text = unescape(re.sub(r"<[^>]*>", " ", markup_of(page)))
+    assert not re.search(r"\d (%|(ms|mm)\b)", text)
+    assert not re.search(r"\d–\d", text)
+    assert re.search("\\d\N{WORD JOINER}–\N{WORD JOINER}\\d", text)
+    for shown in data_of(page)[0]["rows"]:
+        assert not re.search(r"\d–\d", json.dumps(shown["cells"], ensure_ascii=False))
+
+
+def test_the_bars_of_the_whole_cost_show_every_part(tmp_path: Path) -> None:
+    def costs(*lines: CostLine) -> Costs:
+        return Costs(1.0, "fem", [CostLine("fem", "fem", "fem", 0.0, 0.0, 1e-3, None), *lines])
+
+    quick = CostLine("pca", "pca", "pca", 22.0, 3.0, 2e-5, 26_000)
+    slow = CostLine("net", "net", "net", 22.0, 9000.0, 2e-5, 9_200_000)
+    for found, expected in (
+        (costs(quick, slow), 10_000),
+        (costs(slow), 10_000_000),
+        (costs(CostLine("never", "never", "never", 10.0, 0.0, 1e-2, None)), 1_000),
+    ):
+        assert found.queries == expected
+        for line in found.lines[1:2]:
+            share = (line.data + line.fit) / line.total(found.queries)
+            assert 0.05 < share < 0.995
+    assert costs(quick, slow).most_queries == 10**8
+
+
+def test_the_appendix_says_how_to_measure_what_is_missing(page: str) -> None:
+    text = text_of(page)
+    command = r"mor-bench run beam-tiny --profile full"
+    assert re.search(f"did not measure Learning curves, [^:]*: {command}", text)
+    assert re.search(f"Errors beyond the training loads were not measured; {command}", text)
+
+
+def test_the_runner_up_is_one_of_another_method_with_the_same_words(tmp_path: Path) -> None:
+    def text(folder: str, *others: str) -> str:
+        made = tiny(tmp_path / folder)
+        for rank, latency in ((5, 1.0), (10, 1.2)):
+            add_row(made, "pod", {"n_modes": rank}, 0.002, latency)
+        for name in others:
+            add_row(made, name, {}, 0.002, 2.0)
+        return text_of(render(made, analyse(made, n_resamples=50))[-1].read_text("utf-8"))
+
+    alone, both = text("alone"), text("both", "hpod")
+    assert "runner-up (another method)" not in alone
+    assert alone.count("No other method qualifies.") >= 2  # on the card, and in words
+    assert both.count("runner-up (another method) hpod") == 2  # by latency, by offline cost
+    assert "Runner-up (another method): hpod, 2 ms at 0.2 %." in both
+    assert "No other method qualifies." not in both

@@ -12,7 +12,8 @@ from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.verdict import Requirements
 from mor_bench.machine import describe_machine
 from mor_bench.report.entries import Entry, entries_of
-from mor_bench.report.number_format import joined_units
+from mor_bench.report.not_measured import unmeasured
+from mor_bench.report.number_format import joined_units, unbroken
 from mor_bench.report.page_facts import (
     answer_of,
     facts_of,
@@ -116,7 +117,20 @@ def test_the_page_tells_how_to_run_again_and_what_was_not_tested(tmp_path: Path)
     assert "1 of 1 configurations ran and answered every test load." in text
     assert "hold for this body, material, supports and kind of load only" in text
     assert "No test load is centred where a training load is centred" in text
-    assert "No load larger than the training loads was tested." in text
+    full = "`mor-bench run beam-tiny --profile full`"
+    assert f"Errors beyond the training loads were not measured; {full} measures them." in text
+    learning, beyond = unmeasured(run, "beam-tiny", entries)
+    assert learning.startswith("Learning curves, ")
+    assert all(line.endswith(f": {full}.") for line in (learning, beyond))
+    run.settings.update(profile="full")
+    assert unmeasured(run, "beam-tiny", entries) == []
+    run.settings.update(profile="quick")
+    sets = {name: SetErrors(n=9, rel_l2_median=e) for name, e in (("in-range", 0.01), ("2x", 0.08))}
+    tested = [Entry(entries[0].row.with_parts(sets=sets))]
+    assert "Beyond the training loads, the median relative L2 error of pod is 8 % on 2x." in (
+        limits_of(run, analyse(run), tested)
+    )
+    assert len(unmeasured(run, "beam-tiny", tested)) == 1
     assert "Not tested for what they are built for: pod." in text
     assert text.endswith("do not hold its random seed, `--seeds 3` measures it.")
 
@@ -176,3 +190,10 @@ def test_numbers_stay_beside_their_units() -> None:
     space = "\N{NO-BREAK SPACE}"
     assert joined_units("1.47 mm, 5 % of 3 modes") == f"1.47{space}mm, 5{space}% of 3 modes"
     assert joined_units("2 s. 3 steps, 7 N") == f"2{space}s. 3 steps, 7{space}N"
+
+
+def test_intervals_stay_whole_on_the_page() -> None:
+    joiner = "\N{WORD JOINER}"
+    assert unbroken("0.51–0.56 % or 3–∞, pod–nn") == (
+        f"0.51{joiner}–{joiner}0.56\N{NO-BREAK SPACE}% or 3{joiner}–{joiner}∞, pod–nn"
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -120,3 +121,27 @@ def test_the_command_prints_a_choice_and_its_exit_code(small_run: Comparison) ->
     assert done.exit_code == 1
     assert "Enough alone: latency" in done.stdout
     assert command("--error=0").exit_code == 2
+
+
+def test_the_folder_of_a_run_is_evidence_and_names_its_dataset(
+    small_run: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = invoke("pick", "beam-tiny", f"--run={small_run.out}", "--error=10", "--latency=1e4")
+    done = invoke("pick", str(small_run.out), "--error=10", "--latency=1e4")
+    assert (done.exit_code, done.stdout) == (0, named.stdout), done.output
+    limits = mor_bench.pick(small_run.out).requirements
+    assert limits == Requirements(0.01, 3.0)  # those that the run stores
+    monkeypatch.chdir(tmp_path)
+    runs = Path("reports") / "runs"
+    replace(small_run, out=runs / "mine").write()
+    shutil.copytree(small_run.out / "samples", runs / "mine" / "samples")
+    assert mor_bench.pick("mine", error=10.0, latency_ms=1e4).run == runs / "mine"
+    # A dataset goes before a folder of the same name.
+    Path("beam-tiny").symlink_to(runs / "mine")
+    assert mor_bench.pick("beam-tiny", comparison=small_run).run == small_run.out
+    with pytest.raises(InvalidInputError, match="the folder of a run is the evidence itself"):
+        mor_bench.pick("mine", comparison=small_run)
+    several = {**small_run.datasets, "other": small_run.datasets["beam-tiny"]}
+    replace(small_run, out=runs / "several", datasets=several).write()
+    with pytest.raises(InvalidInputError, match="has results for beam-tiny, other; name one: `mor"):
+        mor_bench.pick("several")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from mor_bench.report.canvas import (
     lay_out,
     length_unit,
     uncut,
+    wrapped,
 )
 from mor_bench.report.entries import entries_of
 from mor_bench.report.error_against_deformation import error_against_deformation
@@ -232,6 +234,29 @@ def test_headings_have_few_lines_of_about_the_same_length() -> None:
     assert balanced(text, 40, len) == ["a heading whose last", "word would stand alone"]
     assert balanced("one line", 40, len) == ["one line"]
     assert balanced("x" * 50 + " y", 40, len) == ["x" * 50, "y"]
+
+
+def test_no_heading_breaks_between_a_number_and_its_unit(pictures: dict[str, Picture]) -> None:
+    text = "Where its mean error is largest, pod errs by up to 1.47 mm, hpod by 20 % in 3 ms"
+    for room in range(8, len(text)):
+        lines = wrapped(text, room, len)
+        assert " ".join(lines) == text
+        assert not any(re.match("(mm|%|ms)", line) for line in lines), lines
+    heading = pictures["worst-samples"].figure.texts[0].get_text()
+    assert re.search(r"\d (mm|µm|m)\b", heading)
+    assert not re.search(r"\d\n", heading)
+
+
+def test_worst_samples_say_which_worst_they_show(pictures: dict[str, Picture]) -> None:
+    picture = pictures["worst-samples"]
+    assert picture.finding.startswith("Where its mean error e is largest, ")
+    assert "the test load with its largest mean error e" in picture.figure.texts[
+        1
+    ].get_text().replace("\n", " ")
+    titles = [axes.get_title(loc="left").split("\n") for axes in picture.figure.axes]
+    for _, nodal, relative in (title for title in titles if len(title) == 3):
+        assert re.fullmatch(r"up to [\d.e+-]+ (mm|µm|m)", nodal)
+        assert re.fullmatch(r"relative L2 error [\d.e+-]+ %", relative)
 
 
 def test_lengths_are_given_in_units_with_few_digits() -> None:

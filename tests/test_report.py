@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from matplotlib.text import Text
 from rich.console import Console
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.report.console_tables import Detail, print_tables
 from mor_bench.report.details import dataset_details
 from mor_bench.report.entries import Entry, best_per_method, entries_of
+from mor_bench.report.figures import pictures_of
 from mor_bench.report.number_format import bytes_text, number, percent, short_swept
 from mor_bench.report.page import render
-from mor_bench.report.short_names import renamed, short_names
+from mor_bench.report.short_names import short_names
 from mor_bench.report.speed_tables import NOT_REACHED, pairs_at, target_table
 from mor_bench.report.summary import discretisation_error, warnings_of
+from mor_bench.report.verdict_words import in_words
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import ErrorSummary
 from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
@@ -107,7 +111,7 @@ def test_console_and_page_show_every_row_with_its_reason(comparison: Comparison,
             *summary["headline"].split(". ", 1),
         ):
             flat = " ".join(text.split())
-            assert said in flat or renamed(said, names) in flat
+            assert said in flat or in_words(said, names) in flat
 
 
 def test_a_legacy_code_page_does_not_stop_the_run(comparison: Comparison) -> None:
@@ -215,7 +219,7 @@ def test_the_discretisation_error_is_shown_with_its_evidence() -> None:
     unknown, alone, both = (discretisation_error([Entry(row)]) for row in rows)
     assert unknown == "not measured"
     assert alone.startswith("1.2e-02 m; an error")
-    assert both.startswith("1.2e-02 m, relative L2 (median) 20.5 %; an error")
+    assert both.startswith("1.2e-02 m, relative L2 error 20.5 % (median); an error")
 
 
 def test_a_report_without_a_completed_row_says_so(tmp_path: Path) -> None:
@@ -334,6 +338,28 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
         "configuration told processes queries",
     ):
         assert said in text
+
+
+OTHER_NAMES = re.compile(r"\brel(?:\.|ative)? ?l2\b", re.IGNORECASE)
+"""The relative L2 error in other words, once its own name is taken out of a text."""
+
+
+@pytest.mark.slow
+def test_the_error_has_one_name_on_page_terminal_and_pictures(
+    rich: Comparison, analysis: Analysis
+) -> None:
+    page = render(rich, analysis)[-1].read_text(encoding="utf-8")
+    texts = {"page": text_of(page), "data": json.dumps(data_of(page))}
+    texts["terminal"] = " ".join(console_text(rich, analysis=analysis).split())
+    for picture in pictures_of(rich, "beam-coarse", analysis):
+        drawn = [t for t in picture.figure.findobj(Text) if isinstance(t, Text)]
+        texts[picture.kind] = " ".join(t.get_text().replace("\n", " ") for t in drawn)
+        texts[f"{picture.kind}, caption"] = picture.caption
+    assert "relative L2 error" in texts["page"]
+    for where, text in texts.items():
+        text = re.sub("[Rr]elative L2 (error|difference)", "", text)
+        found = OTHER_NAMES.search(text)
+        assert found is None, (where, text[found.start() - 40 : found.end() + 40])
 
 
 def test_the_matrix_of_pairs_shows_factors_and_intervals(

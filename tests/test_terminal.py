@@ -10,16 +10,18 @@ import sys
 from pathlib import Path
 
 import pytest
+from click import unstyle
 from typer.testing import CliRunner, Result
 
 from mor_bench.cli.app import COMMANDS, app
+from mor_bench.cli.clear_errors import clear_errors
 from mor_bench.cli.console import DEFAULT_WIDTH
 from mor_bench.cli.help_texts import EXIT_CODES
 from mor_bench.options import RunOptions, command_line
 from mor_bench.report.line_wrapping import command_lines
 from mor_bench.report.suite_overview import overview
 from mor_bench.results.comparison import Comparison
-from mor_bench.specs import list_suite, load_method_spec
+from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
 from mor_bench.version import __version__
 from tests.commands import mor_bench_command
 from tests.synthetic import synthetic_comparison
@@ -46,7 +48,7 @@ def test_a_report_in_a_pipe_has_the_width_of_columns(run: Comparison, columns: s
     lines = [line for line in shown.stdout.splitlines() if not line.startswith("  mor-bench ")]
     width = int(columns or DEFAULT_WIDTH)
     assert width - 12 < max(map(len, lines)) <= width
-    assert any(re.match(r"\* fem · tol 0\.1 +[\d.]+ % +[\d.]+ % +[\d.]+ ms", li) for li in lines)
+    assert any(re.match(r"\* fem · tol 0\.1 +[\d.]+ +[\d.]+ +[\d.]+ ", li) for li in lines)
 
 
 def test_wide_tables_show_every_column_in_whole_lines(run: Comparison) -> None:
@@ -155,6 +157,37 @@ def test_an_unknown_command_gets_the_nearest_one() -> None:
     assert "No such command 'rum'. Did you mean 'run'?" in " ".join(found.output.split())
 
 
+def test_a_terminal_gets_the_names_that_exist_the_most_similar_first(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    for load, name in ((load_method_spec, "pood"), (load_dataset_spec, "beam-tini")):
+        with pytest.raises(SystemExit), clear_errors():
+            load(name)
+    said = unstyle(capsys.readouterr().err)
+    methods, datasets = said.split("mor-bench: unknown dataset ")
+    first, nearest, *families = methods.splitlines()
+    assert first == (
+        "mor-bench: unknown method 'pood'; did you mean 'pod'? `mor-bench list` shows the names."
+    )
+    assert nearest.startswith("  most similar: pod, ")
+    assert "  hyper-reduction: hpod, ecm, deim" in families
+    assert max(map(len, [nearest, *families])) <= 60
+    listed = re.findall(r"[\w-]+", " ".join(line.partition(":")[2] or line for line in families))
+    assert set(listed) >= set(list_suite("methods"))
+    assert datasets.startswith("'beam-tini'; did you mean 'beam-tiny'?")
+    assert "\n  most similar: beam-tiny" in datasets
+    assert max(map(len, datasets.splitlines()[1:])) <= 60
+
+
+def test_a_program_gets_an_unknown_name_in_one_line() -> None:
+    shown = mor_bench("run", "beam-tiny", "-m", "pood")
+    assert shown.stderr.splitlines() == [
+        "mor-bench: unknown method 'pood'; did you mean 'pod'? `mor-bench list` shows the names."
+    ]
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -193,7 +226,7 @@ def test_what_method_files_state_about_needs_is_true() -> None:
 import sys
 sys.modules["torch"] = None
 from mor_bench.errors import MissingDependencyError
-from mor_bench.specs import list_suite, load_method_spec
+from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
 for name in list_suite("methods"):
     try:
         load_method_spec(name).load_class()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from threading import Timer, current_thread, main_thread
 from types import FrameType
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from mor_bench.errors import MorBenchError, printable
+from mor_bench.errors import MorBenchError, UnknownNameError, printable
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
@@ -52,6 +52,8 @@ def clear_errors() -> Iterator[None]:
         with _signals_as_interrupts():
             yield
             sys.stdout.flush()
+    except UnknownNameError as error:
+        _exit(str(error), "red", 2, _known(error))
     except MorBenchError as error:
         _exit(str(error), "red", 2)
     except BrokenPipeError:
@@ -148,7 +150,19 @@ def _forget_output() -> None:
         os.close(nothing)
 
 
-def _exit(message: str, colour: str, code: int) -> None:
+def _known(error: UnknownNameError) -> list[str]:
+    """Return the names that exist, for a reader at a terminal; a program gets one line."""
+    if not sys.stderr.isatty():
+        return []
+    from mor_bench.cli.console import console_width  # slow to import
+    from mor_bench.cli.known_names import known_lines
+
+    return [printable(line, keep="") for line in known_lines(error, console_width())]
+
+
+def _exit(message: str, colour: str, code: int, more: Sequence[str] = ()) -> None:
     with suppress(OSError):  # the terminal may be gone
         typer.secho(f"mor-bench: {printable(message, keep='')}", fg=colour, err=True)
+        for line in more:
+            typer.echo(line, err=True)
     raise SystemExit(code) from None

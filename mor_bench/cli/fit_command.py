@@ -105,7 +105,7 @@ def fit(
         f"{name} {error[f'rel_l2_{name}']:.3%}" for name in ("median", "p95", "max")
     )
     print_wrapped(
-        f"test error: ē {error['mean_dof_m']:.2e} m, relative l2 {relative} "
+        f"test error: ē {error['mean_dof_m']:.2e} m, relative L2 error {relative} "
         f"({fitted.n_test:,} samples)"
     )
     print(fitted.out)

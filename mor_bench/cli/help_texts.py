@@ -11,7 +11,8 @@ from typer.core import TyperCommand
 
 EXIT_CODES = {
     0: "The command did what it says.",
-    2: "An option, a name or a file is not valid. Standard error says why, in one line.",
+    2: "An option, a name or a file is not valid. Standard error says why, in one line. At a "
+    "terminal, the names that exist follow one that does not.",
     130: "Ctrl-C stopped the command. Signal n gives 128 + n.",
 }
 """Meanings of the exit codes of every command."""

@@ -19,10 +19,10 @@ from mor_bench.analysis.verdict import Verdict
 from mor_bench.cli.console import console_width, make_console
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import (
-    DatasetName,
     Json,
     QuietOutput,
     TableOutput,
+    complete_datasets,
     with_options,
 )
 from mor_bench.cli.run_progress import show_run
@@ -32,7 +32,8 @@ from mor_bench.report.console_tables import finding_lines, print_tables, sentenc
 from mor_bench.report.line_wrapping import wrapped
 from mor_bench.report.number_format import explain_short_names
 from mor_bench.report.page import render
-from mor_bench.report.short_names import renamed, short_names
+from mor_bench.report.short_names import short_names
+from mor_bench.report.verdict_words import in_words
 from mor_bench.runs.plan import plan
 from mor_bench.specs.method_spec import Told
 
@@ -49,7 +50,7 @@ class PickOptions(FolderOptions):
 
     error: Annotated[
         float | None,
-        Field(description="Upper limit of the median relative l2 error; 0.01 is 1 %."),
+        Field(description="Upper limit of the median relative L2 error; 0.01 is 1 %."),
         CommandLine(default="the dataset's need"),
     ] = None
     latency_ms: Annotated[
@@ -115,10 +116,22 @@ def report(
         print(path)
 
 
+PickedDataset = Annotated[
+    str,
+    typer.Argument(
+        metavar="DATASET|RUN_DIR",
+        help="Name or TOML file of a dataset, or the folder of a run of one dataset: then its "
+        "stored results are the evidence.",
+        autocompletion=complete_datasets,
+    ),
+]
+
+
 @command(
     app,
     {
-        "pick beam-coarse": "Choose by the limits of the dataset's [needs].",
+        "pick beam-coarse": "Choose by the limits of the dataset's [needs], on the evidence of the "
+        "newest run. The folder of a run also names its dataset.",
         "pick beam-coarse --error 0.003 --memory 0.5": "Choose with an error of at most 0.3 % and "
         "with at most 0.5 GB.",
     },
@@ -126,7 +139,7 @@ def report(
 )
 @with_options
 def pick(
-    dataset: DatasetName,
+    dataset: PickedDataset,
     *,
     options: PickOptions,
     output: QuietOutput,
@@ -151,7 +164,7 @@ def _lines(chosen: Verdict, width: int, *, quiet: bool) -> Iterator[str]:
     """Yield the verdict in lines of this width: the headline, its figures, all else."""
     names = short_names(chosen.rows)
     if quiet:
-        yield from wrapped(renamed(chosen.headline, names), width, names=names.values())
+        yield from wrapped(in_words(chosen.headline, names), width, names=names.values())
         return
     yield from finding_lines(chosen.headline, names, width)
     for line in chosen.evidence:
@@ -159,7 +172,7 @@ def _lines(chosen: Verdict, width: int, *, quiet: bool) -> Iterator[str]:
         first = (
             name[0] if name and line.startswith("    ") else " " * (len(line) - len(line.lstrip()))
         )
-        text = renamed(line, names)[len(first) :]
+        text = in_words(line, names)[len(first) :]
         yield from wrapped(text, width, " " * len(first), first=first, names=names.values())
     yield from sentence_lines(chosen.headline, chosen.beside, names, width)
     swept = explain_short_names(row.swept for row in chosen.rows)

@@ -75,9 +75,11 @@ class _Left(ProgressColumn):
 
 
 def _rounded(seconds: float) -> str:
-    """Format a duration with one or two digits."""
+    """Format a duration with two digits or so."""
     if seconds < 100:
         return f"{max(seconds, 1):.0f} s"
+    if seconds < 570:
+        return f"{seconds / 60:.1f} min"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
 
@@ -173,7 +175,9 @@ class _Shown:
 
     def _print(self, text: str, style: str | None = None) -> None:
         self._spoken()
-        self._progress.console.print(text, style=style, highlight=False, markup=False)
+        self._progress.console.print(
+            text, style=style, highlight=False, markup=False, soft_wrap=True
+        )
 
 
 def _method(label: str) -> str:

@@ -165,7 +165,7 @@ def _published(method: Surrogate, snapshots: Snapshots) -> tuple[bool, str, dict
         "rel_l2_p95": p95,
         "rel_l2_max": most,
     }
-    shown = f"relative l2 {median:.2g} median, {p95:.2g} p95, {most:.2g} max"
+    shown = f"relative L2 error {median:.2g} median, {p95:.2g} p95, {most:.2g} max"
     if failed.any():
         shown += f", {numbers['n_failed']} of {len(relative)} without an answer"
     return finite, shown if finite else f"{shown}, some not finite", numbers
@@ -238,7 +238,8 @@ def symmetry(subject: Subject) -> Outcome:
     median, most = float(np.median(off)), float(off.max())
     return judged(
         bool(np.isfinite(off).all()) and (not exact or most <= MIRRORED),
-        f"relative l2 between an answer and its mirror image {median:.2g} median, {most:.2g} max",
+        f"relative L2 difference of an answer and its mirror image {median:.2g} median, "
+        f"{most:.2g} max",
         median=median,
         max=most,
     )
@@ -321,7 +322,8 @@ def _low_precision(subject: Subject, predict: Callable[[Surrogate, Array], Array
     mesh = subject.scenes.discretisation_error
     return judged(
         added <= ADDED * max(error, mesh),
-        f"adds {added:.1e} to a relative l2 of {error:.1e} (the mesh has {mesh:.1e}), medians",
+        f"adds {added:.1e} to a relative L2 error of {error:.1e} (the mesh has {mesh:.1e}), "
+        "medians",
         added=added,
         error=error,
         discretisation=mesh,

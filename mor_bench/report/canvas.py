@@ -19,6 +19,8 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from mor_bench.report.line_wrapping import KEPT
+from mor_bench.report.number_format import joined_units
 from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import make_own_folder, write_atomically
 
@@ -158,15 +160,18 @@ def balanced(text: str, room: float, width: Callable[[str], float]) -> list[str]
 
 
 def wrapped(text: str, room: float, width: Callable[[str], float]) -> list[str]:
-    """Break a text into lines of at most a width; a longer word stands alone."""
+    """Break a text into lines of at most a width; a longer word stands alone.
+
+    No line breaks between a number and its unit.
+    """
     lines = [""]
-    for word in text.split():
+    for word in re.split("[ \n]+", joined_units(text).strip()):
         longer = f"{lines[-1]} {word}".strip()
         if lines[-1] and width(longer) > room:
             lines.append(word)
         else:
             lines[-1] = longer
-    return lines
+    return [line.replace(KEPT, " ") for line in lines]
 
 
 def dress(axes: Axes) -> None:

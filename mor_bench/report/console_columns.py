@@ -12,10 +12,8 @@ from mor_bench.report.number_format import (
     DASH,
     bytes_text,
     metres,
-    milliseconds_text,
     number,
     percent,
-    seconds_text,
     span,
 )
 from mor_bench.report.short_names import ShortName
@@ -28,17 +26,13 @@ NOTE = (
 """Explanation of the marks and of the one column that needs it."""
 
 
-def _with_unit(shown: Callable[[float | None], str], unit: str) -> Callable[[float | None], str]:
-    return lambda value: DASH if value is None else f"{shown(value)}{unit}"
-
-
-_percent = _with_unit(percent, " %")
-_metres = _with_unit(metres, " m")
-
-
 def _latency(entry: Entry) -> str:
-    text = milliseconds_text(entry.figure("latency_ms", "median"))
+    text = number(entry.figure("latency_ms", "median"))
     return f"~{text}" if entry.unstable else text
+
+
+def _offline(entry: Entry) -> str:
+    return number(entry.row.offline_core_s) + "°" * bool(entry.row.trained_elsewhere)
 
 
 def _qualifies(entry: Entry) -> str:
@@ -48,13 +42,13 @@ def _qualifies(entry: Entry) -> str:
 
 
 MAIN: dict[str, Cell] = {
-    "error\nmedian": figure_cell("error", "rel_l2_median", _percent),
-    "error\np95": figure_cell("error", "rel_l2_p95", _percent),
-    "latency\nmedian": _latency,
-    "offline": lambda e: seconds_text(e.row.offline_core_s) + "°" * bool(e.row.trained_elsewhere),
+    "error\nmedian\n(%)": figure_cell("error", "rel_l2_median", percent),
+    "error\np95\n(%)": figure_cell("error", "rel_l2_p95", percent),
+    "latency\nmedian\n(ms)": _latency,
+    "offline\n(core-s)": _offline,
     "qualifies": _qualifies,
 }
-"""The columns beside the name that are always shown."""
+"""The columns beside the name that are always shown; each has one unit, in its heading."""
 
 
 def _interval(name: str, shown: Callable[[float | None], str] = number) -> Cell:
@@ -71,19 +65,19 @@ def _seeds(name: str, shown: Callable[[float | None], str]) -> Cell:
 
 FURTHER: dict[str, Cell] = {
     "error 95 %\n(%)": _interval("rel_l2_median", percent),
-    "error\nmax": figure_cell("error", "rel_l2_max", _percent),
+    "error\nmax\n(%)": figure_cell("error", "rel_l2_max", percent),
     "seeds 95 %\n(%)": _seeds("rel_l2_median", percent),
-    "ē": figure_cell("error", "mean_dof_m", _metres),
-    "σ(e)": figure_cell("error", "std_dof_m", _metres),
-    "max e": figure_cell("error", "max_dof_m", _metres),
+    "ē\n(m)": figure_cell("error", "mean_dof_m", metres),
+    "σ(e)\n(m)": figure_cell("error", "std_dof_m", metres),
+    "max e\n(m)": figure_cell("error", "max_dof_m", metres),
     "seeds ē\n95 % (m)": _seeds("mean_dof_m", metres),
     "latency 95 %\n(ms)": _interval("latency_ms"),
-    "latency\np95": figure_cell("latency_ms", "p95", milliseconds_text),
-    "latency\np99": figure_cell("latency_ms", "p99", milliseconds_text),
-    "all\nthreads": figure_cell("all_threads_ms", "median", milliseconds_text),
+    "latency\np95\n(ms)": figure_cell("latency_ms", "p95"),
+    "latency\np99\n(ms)": figure_cell("latency_ms", "p99"),
+    "all\nthreads\n(ms)": figure_cell("all_threads_ms", "median"),
     "queries/s\nby 64": figure_cell("throughput", "64"),
-    "data\n(core-s)": figure_cell("offline_s", "data", seconds_text),
-    "fit": figure_cell("offline_s", "fit", seconds_text),
+    "data\n(core-s)": figure_cell("offline_s", "data"),
+    "fit\n(s)": figure_cell("offline_s", "fit"),
     "memory": figure_cell("memory_bytes", "predict", bytes_text),
     "model": lambda e: bytes_text(e.row.model_bytes),
     "threads": lambda e: str(e.row.threads or DASH),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
@@ -15,6 +16,7 @@ from rich.text import Text
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.told import LEGEND
 from mor_bench.analysis.verdict import needs_of
+from mor_bench.report.aligned_lines import Line, aligned_lines
 from mor_bench.report.caveat_tables import out_of_range
 from mor_bench.report.console_columns import NOTE, configuration_lines
 from mor_bench.report.entries import (
@@ -26,6 +28,7 @@ from mor_bench.report.entries import (
     verdict_of,
 )
 from mor_bench.report.line_wrapping import command_lines, wrapped
+from mor_bench.report.not_measured import beyond_training
 from mor_bench.report.number_format import (
     explain_short_names,
     metres,
@@ -43,6 +46,7 @@ from mor_bench.report.speed_tables import (
 )
 from mor_bench.report.summary import hidden_doubts, interval_basis, notes_of, origins, warnings_of
 from mor_bench.report.text_table import TextTable, with_information, with_short_names
+from mor_bench.report.verdict_words import ERROR, in_words
 from mor_bench.results.comparison import Comparison
 
 if TYPE_CHECKING:
@@ -131,7 +135,7 @@ def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
 
 def finding_lines(headline: str, names: Mapping[str, ShortName], width: int) -> list[str]:
     """Return the finding of a verdict's headline, with short names."""
-    finding = renamed(headline, names).partition(". ")[2]
+    finding = in_words(headline, names).partition(". ")[2]
     return wrapped(finding, width, names=names.values())
 
 
@@ -140,7 +144,7 @@ def sentence_lines(
 ) -> Iterator[str]:
     """Yield the needs of a verdict's headline and all other sentences, with short names."""
     for sentence in (f"{headline.partition('. ')[0]}.", *sentences):
-        text, again, command = renamed(sentence, names).partition(AGAIN)
+        text, again, command = in_words(sentence, names).partition(AGAIN)
         text += again.rstrip()
         yield from wrapped(f"- {text}", width, "  ", names=names.values())
         if again:
@@ -225,6 +229,8 @@ def _dataset_parts(
     for text in (NOTE, explain_short_names(swept), f"Same in all rows: {fixed}." if fixed else ""):
         if text:
             yield from _wrapped(text, console.width, "dim")
+    beyond = beyond_training(comparison, dataset, entries, verdict.get("choice"))
+    yield from _wrapped(renamed(beyond, names), console.width, "dim", names)
     yield from _failures(entries, names, console.width)
     notes = _notes if detail.verbose else _short_notes
     for note in notes(comparison, dataset, entries, analysis):
@@ -242,7 +248,7 @@ def _wide_parts(
     yield from _titled("Figures of the winner, or of the nearest without a winner")
     names = short_names(entry.row for entry in entries)
     for line in verdict_of(analysis, dataset)["evidence"]:
-        yield Text(renamed(line, names), no_wrap=True)
+        yield Text(in_words(line, names), no_wrap=True)
     for kind in ("time_at_error", "error_at_time"):
         yield from _target_parts(target_table(comparison, dataset, kind, analysis))
     basis = [interval_basis(dataset, analysis), "Nothing is extrapolated."]
@@ -264,7 +270,7 @@ def print_tables(
             if detail.quiet:
                 names = short_names(row for row in comparison.rows if row.dataset == name)
                 headline = verdict_of(analysis, name).get("headline", f"{name}: no configuration.")
-                for line in _wrapped(renamed(headline, names), console.width, names=names):
+                for line in _wrapped(in_words(headline, names), console.width, names=names):
                     _print(line, console)
                 continue
             for part in _dataset_parts(comparison, name, analysis, console, detail):
@@ -290,7 +296,8 @@ def _print(part: RenderableType, console: Console) -> None:
 def print_discretisation(record: Mapping[str, Any], console: Console) -> None:
     """Print a record of `mor_bench.measure.discretisation_error.refine`: loads, means, meshes."""
     table = _empty_table()
-    for heading in ("sample", "patch", "force\nN", "e\nm", "rel L2\n%", "order", "limit"):
+    headings = ("sample", "patch", "force\nN", "e\nm", "relative\nL2 error\n%", "order", "limit")
+    for heading in headings:
         table.add_column(heading, justify="right")
     for load in record["loads"]:
         table.add_row(
@@ -316,22 +323,37 @@ def print_discretisation(record: Mapping[str, Any], console: Console) -> None:
             console.print(Text(f"{kind}: {', '.join(shown)}"))
     relative = percent(record["relative_l2"])
     mean = (
-        f"mean e {metres(record['error_m'])} m, relative L2 {relative} % "
+        f"mean e {metres(record['error_m'])} m, {ERROR} {relative} % "
         f"(median {percent(record['relative_l2_median'])} %)"
     )
     console.print(Text(f"discretisation error of {record['dataset']}: {mean}", style="bold"))
 
 
+_NOT_FITTED = re.compile(r"(.*) \((left out|trained elsewhere)(?:: (.*))?\)", re.DOTALL)
+"""Label of a step that takes no time: the configuration, what happens to it, and the reason."""
+
+
+def _plan_lines(plan: Plan, width: int) -> Iterator[Line]:
+    """Yield a line per step, below the name of its dataset, with its estimated seconds."""
+    for dataset in dict.fromkeys(step.dataset for step in plan.steps):
+        yield Line([f"– {dataset} –"], "dim italic")
+        for step in (step for step in plan.steps if step.dataset == dataset):
+            shown = "unknown" if step.seconds is None else number(step.seconds)
+            shown = "in the cache" if step.done else shown
+            found = _NOT_FITTED.fullmatch(step.label)
+            name, why = step.label, ""
+            if found:
+                name, shown, why = found[1], found[2], found[3] or ""
+            yield Line([f"  {name}", shown])
+            for part in wrapped(why, width, "    ", first="    "):
+                yield Line([part], "dim")
+
+
 def print_plan(plan: Plan, console: Console) -> None:
-    """Print the plan of a run, a row per dataset and configuration, and its estimated time."""
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1), show_edge=False)
-    for heading in ("dataset", "step"):
-        table.add_column(heading)
-    table.add_column("estimate", justify="right")
-    for step in plan.steps:
-        estimate = "unknown" if step.seconds is None else seconds_text(step.seconds)
-        table.add_row(step.dataset, Text(step.label), "in the cache" if step.done else estimate)
-    console.print(table, highlight=False)
+    """Print the plan of a run, a row per step, and its estimated time; no name is broken."""
+    lines = list(_plan_lines(plan, console.width))
+    for text in aligned_lines(["  step", "estimate (s)"], lines, console.width):
+        _print(text, console)
     unknown = f", and {plan.n_unknown} steps of unknown duration" if plan.n_unknown else ""
     stages: dict[str, StageName] = {
         "compilation, once per machine": "compilation",
@@ -343,6 +365,7 @@ def print_plan(plan: Plan, console: Console) -> None:
     parts = ", ".join(
         f"{name} {seconds_text(seconds)}" for name, seconds in known.items() if seconds
     )
-    console.print(Text(f"beside these steps: {parts}"))
+    for line in wrapped(f"beside these steps: {parts}", console.width):
+        console.print(Text(line))
     total = f"about {seconds_text(plan.seconds)}"
     console.print(Text(total + unknown, style="bold"))

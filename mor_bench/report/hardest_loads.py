@@ -54,7 +54,7 @@ def _worst(found: Sequence[Sampled], arrays: Mapping[str, NDArray[Any]]) -> Text
         "Worst test loads of each method",
         f"{NUMBERS}The largest e, the mean absolute error per degree of freedom, and last the "
         "largest relative error.",
-        ["configuration", "test load", "e (mm)", "relative L2 (%)", *_LOAD],
+        ["configuration", "test load", "e (mm)", "relative L2 error (%)", *_LOAD],
         rows,
     )
 
@@ -81,7 +81,7 @@ def _shared(found: Sequence[Sampled], arrays: Mapping[str, NDArray[Any]]) -> lis
     ]
     note = (
         f"{NUMBERS}A load is hard for a configuration if it is in the tenth of the loads with its "
-        "largest relative errors. Relative L2: the smallest and the largest error of these "
+        "largest relative L2 errors. Beside it: the smallest and the largest of these "
         "configurations."
     )
     headings = ["test load", "hard for", "smallest (%)", "largest (%)", *_LOAD]

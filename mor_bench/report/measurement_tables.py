@@ -128,7 +128,8 @@ def seeds(entries: Sequence[Entry]) -> TextTable | None:
         failed = "\n".join(found.failed) or DASH
         rows.append([entry.label, f"{found.n} of {found.asked}", *figures, failed])
     statistics = ("median", "min–max", "another training")
-    named = [f"{name}: {what}" for name in ("rel. L2 (%)", "ē (m)") for what in statistics]
+    measures = ("relative L2 error (%)", "ē (m)")
+    named = [f"{name}: {what}" for name in measures for what in statistics]
     note = (
         "The same configuration trained with other seeds; all other tables show the first "
         "seed. The figures describe the median relative L2 error and ē of these "

@@ -79,7 +79,7 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
         ),
     ),
     "projection": (
-        (("#005B94", "#56B4E9"), ("#0080C7", "#9ACFF2"), ("#00385C", "#2E9BD9")),
+        (("#005B94", "#56B4E9"), ("#0080C7", "#BFE3F8"), ("#00385C", "#2B86C4")),
         (
             "pod",
             "local-pod",
@@ -93,11 +93,11 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
         ),
     ),
     "hyper-reduction": (
-        (("#D55E00", "#FF9248"), ("#973F00", "#FFBE94"), ("#EA5B2B", "#F2701A")),
+        (("#D55E00", "#FF9248"), ("#973F00", "#FFD3B5"), ("#EA5B2B", "#DC5A00")),
         ("hpod", "ecm", "deim"),
     ),
     "regression on modes": (
-        (("#009E73", "#2FCB9F"), ("#006548", "#8CE5CB"), ("#2E8C6C", "#17A67C")),
+        (("#009E73", "#2FCB9F"), ("#006548", "#B5F2DF"), ("#2E8C6C", "#0E9169")),
         (
             "pca-regression-linear",
             "pca-ridge",
@@ -111,7 +111,7 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
         ),
     ),
     "polynomials and separated functions": (
-        (("#8C6D31", "#E5B252"), ("#5E4716", "#F1D6A0"), ("#A5802F", "#C0943A")),
+        (("#8C6D31", "#E5B252"), ("#5E4716", "#F8E6C4"), ("#A5802F", "#A67C24")),
         (
             "sparse-polynomial",
             "pgd",
@@ -121,7 +121,7 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
         ),
     ),
     "neural networks": (
-        (("#C4609A", "#E39AC4"), ("#86305F", "#F5CBE3"), ("#A8417E", "#D877AE")),
+        (("#C4609A", "#E39AC4"), ("#86305F", "#F9DDEE"), ("#A8417E", "#C85A98")),
         (
             "umesh-small",
             "umesh-linear",
@@ -133,7 +133,7 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
         ),
     ),
     "neural operators and graphs": (
-        (("#2A93CC", "#7CC4EE"), ("#1B6A96", "#B5E0F8"), ("#3C8FB8", "#4FA9D8")),
+        (("#2A93CC", "#7CC4EE"), ("#1B6A96", "#CBE9FA"), ("#3C8FB8", "#3D88B4")),
         ("deeponet", "fno", "mesh-graph-net", "pod-deeponet"),
     ),
 }

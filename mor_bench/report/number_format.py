@@ -38,8 +38,8 @@ MEANINGS = {
 """Meanings of some parameters with short names."""
 
 BEFORE_UNIT = re.compile(
-    r"(?<=\d) (?=(?:%|[nµm]?s|min|h|[kmµ]?m|[kM]?N|[kMG]?B|[kMG]?Pa|core-(?:s|min|h)|core-seconds"
-    r"|times)(?![\w/-]))"
+    r"(?<=\d) (?=(?:%|[nµm]?s|min|h|[kmµ]?m[²³]?|[kM]?N|[kMG]?B|[kMG]?Pa"
+    r"|core-(?:s|min|h)|core-seconds|times)(?![\w/-]))"
 )
 """The space between a number and its unit."""
 
@@ -47,6 +47,20 @@ BEFORE_UNIT = re.compile(
 def joined_units(text: str) -> str:
     """Return a text in which no line breaks between a number and its unit."""
     return BEFORE_UNIT.sub("\N{NO-BREAK SPACE}", text)
+
+
+_IN_INTERVAL = re.compile(r"(?<=[\d∞])–(?=[\d∞])")
+"""The dash of an interval."""
+
+_IN_UNIT = re.compile("(?<=\N{NO-BREAK SPACE}core)-(?=[a-z])")
+"""The hyphen of a unit such as core-s."""
+
+
+def unbroken(text: str) -> str:
+    """As `joined_units`; on the page no line breaks inside an interval or a unit either."""
+    joiner = "\N{WORD JOINER}"
+    joined = _IN_INTERVAL.sub(f"{joiner}–{joiner}", joined_units(text))
+    return _IN_UNIT.sub(f"-{joiner}", joined)
 
 
 def number(value: float | None) -> str:

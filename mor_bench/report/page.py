@@ -20,7 +20,7 @@ from mor_bench.report.entries import Analysis, dataset_names
 from mor_bench.report.figures import write_figures
 from mor_bench.report.hard_case_table import stress_table
 from mor_bench.report.method_view import method_view
-from mor_bench.report.number_format import joined_units, whole
+from mor_bench.report.number_format import unbroken, whole
 from mor_bench.report.page_facts import machine_facts, method_facts
 from mor_bench.report.page_index import standings
 from mor_bench.report.page_scripts import Assets, beside, embedded_json, inlined
@@ -207,7 +207,7 @@ def _data_uri(path: Path) -> str:
 
 def _joined(value: Any) -> Any:
     """Keep numbers beside their units in every text of a template."""
-    return joined_units(value) if type(value) is str else value
+    return unbroken(value) if type(value) is str else value
 
 
 def _code(text: str) -> Markup:
@@ -217,7 +217,7 @@ def _code(text: str) -> Markup:
         words = re.sub(r"(\S*-\S*)", r'<span class="whole">\1</span>', found[1])
         return f"<code>{words}</code>"
 
-    return Markup(re.sub("`([^`]*)`", shown, str(escape(joined_units(text)))))
+    return Markup(re.sub("`([^`]*)`", shown, str(escape(unbroken(text)))))
 
 
 def _slug(text: str) -> str:

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.page_samples import Sampled, outline
+from mor_bench.report.page_worst import LOAD_OF_KIND
 from mor_bench.report.projection import normals
+from mor_bench.report.verdict_words import ERROR
 from mor_bench.scene.mesh import Mesh
 
 KINDS = ("worst", "typical")
@@ -87,22 +89,36 @@ def _sample(
         return None
     size_m = float(np.linalg.norm(np.diff(mesh.bounds, axis=0)))
     error = prediction - reference
-    largest = float(np.linalg.norm(error, axis=1).max())
-    norm = float(np.linalg.norm(reference))
-    relative = float(np.linalg.norm(error)) / norm if norm else None
-    text = f"largest error {number(1e3 * largest)} mm"
-    text += "" if relative is None else f", relative L2 {percent(relative)} %"
     force = _arrow(mesh, reference, forces)
-    text = f"load of {number(force['newton'])} N: {text}" if force else text
     return {
         "label": item.entry.label,
         "kind": kind,
         "reference": packed(reference[nodes]),
         # A wild prediction would shrink the body to a dot.
         "error": packed(np.clip(error[nodes], -0.5 * size_m, 0.5 * size_m)),
-        "text": text,
+        **_said(item, kind, error, reference),
         "force": force,
     }
+
+
+def _said(
+    item: Sampled, kind: str, error: NDArray[np.float64], reference: NDArray[np.float64]
+) -> dict[str, str]:
+    """Return a short caption of a sample, and a sentence that says which load it is.
+
+    The load with the largest mean error may not be the one with the largest relative error; then
+    the sentence states that one as well.
+    """
+    nodal = f"{number(1e3 * float(np.linalg.norm(error, axis=1).max()))} mm"
+    norm = float(np.linalg.norm(reference))
+    if not norm:
+        return {"caption": nodal, "said": f"{LOAD_OF_KIND[kind]}: {nodal} at a node"}
+    relative = float(np.linalg.norm(error)) / norm
+    said = f"{LOAD_OF_KIND[kind]}: {nodal} at a node, {ERROR} {percent(relative)} %"
+    largest = item.entry.figure("error", "rel_l2_max")
+    if kind == "worst" and largest is not None and percent(largest) != percent(relative):
+        said += f" (largest of all test loads: {percent(largest)} %)"
+    return {"caption": f"{nodal}, {percent(relative)} %", "said": said}
 
 
 def _arrow(

@@ -148,7 +148,7 @@ def cells_of(entry: Entry) -> dict[str, list[str]]:
             number(entry.figure("latency_ms", "median")) + ("~" if entry.unstable else ""),
             span(latency) if latency else "",
         ],
-        "offline": [offline_text(entry), ""],
+        "offline": [number(entry.row.offline_core_s), ""],
     }
 
 
@@ -160,7 +160,7 @@ def hover_of(entry: Entry, names: Mapping[str, str]) -> list[str]:
         f"error {cells['error'][0]} %" + (f" [{cells['error'][1]}]" if cells["error"][1] else ""),
         f"latency {cells['latency'][0].rstrip('~')} ms"
         + (f" [{cells['latency'][1]}]" if cells["latency"][1] else ""),
-        f"offline {cells['offline'][0]}",
+        f"offline {offline_text(entry)}",
         f"told: {entry.group}",
         *(f"{key} = {value}" for key, value in entry.row.parameters.items()),
     ]

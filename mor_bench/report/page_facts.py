@@ -9,16 +9,19 @@ from typing import Any
 import numpy as np
 
 from mor_bench.analysis.selection import asked_of, bounds_of
-from mor_bench.analysis.selection_text import limits_missed, needs_text, run_command
+from mor_bench.analysis.selection_text import limits_missed, run_command
 from mor_bench.analysis.verdict import Requirements, needs_of
 from mor_bench.measure.discretisation_error import measured
 from mor_bench.report.cards import pair_text
-from mor_bench.report.entries import Analysis, Entry
+from mor_bench.report.entries import Analysis, Entry, verdict_of
 from mor_bench.report.method_styles import style_of
+from mor_bench.report.not_measured import beyond_training
 from mor_bench.report.number_format import bytes_text, number
 from mor_bench.report.page_samples import dataset_arrays
 from mor_bench.report.scene_text import recorded_scene
+from mor_bench.report.short_names import renamed, short_names
 from mor_bench.report.summary import discretisation_error
+from mor_bench.report.verdict_words import needs_in_words
 from mor_bench.results.comparison import Comparison
 
 
@@ -87,6 +90,7 @@ def _answered(entries: Sequence[Entry]) -> str:
 
 def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entry]) -> str:
     """State for what a run holds, and what it does not tell: regimes, other loads, other seeds."""
+    dataset = next((entry.row.dataset for entry in entries), "")
     present = {entry.method for entry in entries}
     outside = [
         record["method"]
@@ -101,10 +105,11 @@ def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entr
     split = next((entry.row.split for entry in entries if entry.ran), None)
     if split in _UNSEEN:
         said.append(_UNSEEN[split])
-    if counts := _patches(comparison.datasets.get(entries[0].row.dataset, {}), entries):
+    if counts := _patches(comparison.datasets.get(dataset, {}), entries):
         said.append(f"The split: {_samples(entries)}{counts}.")
-    if not any(entry.row.sets for entry in entries):
-        said.append("No load larger than the training loads was tested.")
+    choice = verdict_of(analysis, dataset).get("choice")
+    beyond = beyond_training(comparison, dataset, entries, choice)
+    said.append(renamed(beyond, short_names(entry.row for entry in entries)))
     if processor := comparison.machine.get("processor"):
         said.append(f"Latencies hold for {processor}; `--retime` measures them on another machine.")
     if outside:
@@ -183,7 +188,7 @@ def facts_of(
             "samples refused by the full-order model (no stable equilibrium found)",
             "not recorded" if refused is None else f"{int(refused):,}, in no part of the split",
         ),
-        ("needs", needs_text(needs_of(comparison, dataset))),
+        ("needs", needs_in_words(needs_of(comparison, dataset))),
         ("degrees of freedom", _values(f"{row.n_dofs:,}" for row in rows if row.n_dofs)),
         ("discretisation error of the dataset's mesh", discretisation_error(entries)),
         *_refinement(spec),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mor_bench.report.number_format import number, whole
+from mor_bench.report.verdict_words import ERROR
 
 Data = Mapping[str, Any]
 
@@ -35,7 +36,8 @@ def frontier(data: Data, title: str) -> Chart:
     reading = (
         "Left and down is better. Lines join the configurations of a method. Bars are 95 % "
         "intervals, for medians only. Open markers: the timing was not stable. A label with a "
-        "number belongs to a marker beyond the axis, drawn at its edge. The dashed steps "
+        "value belongs to a marker beyond the axis, drawn at its edge. On a phone, the list below "
+        "names the numbers. The dashed steps "
         "are the Pareto front. References solve the full equations on the dataset's own mesh. "
         "Click on the legend to hide a method, double-click to isolate it. By keyboard: Tab to the "
         "legend, arrow keys to an entry, then Enter or Shift+Enter."
@@ -65,8 +67,8 @@ def _ecdf(data: Data) -> str:
     line = _first(data, drawn)
     error = _row(data, line["label"])["error"]
     return (
-        f"{_name(data, line)}: 95 % of the test loads have an error below "
-        f"{number(error['p95'])} %, the worst has {number(error['max'])} %"
+        f"{_name(data, line)}: 95 % of the test loads have a {ERROR} below "
+        f"{number(error['p95'])} %, the largest is {number(error['max'])} %"
     )
 
 
@@ -86,8 +88,8 @@ def _position(data: Data) -> str:
     place = data["positions"]["centres"][line["error"].index(max(known))]
     where = ", ".join(f"{x:.3g}" for x in place)
     return (
-        f"{_name(data, line)}: {number(min(known))} to {number(max(known))} %, largest where the "
-        f"load acts around ({where}) m"
+        f"{_name(data, line)}: median {ERROR} {number(min(known))} to {number(max(known))} %, "
+        f"largest where the load acts around ({where}) m"
     )
 
 
@@ -115,7 +117,7 @@ def _costs(data: Data) -> str:
 
 def _bodies(data: Data) -> str:
     line = _first(data, data["bodies"]["samples"])
-    return f"{_name(data, line)}, {line['kind']} test load by e: {line['text']}"
+    return f"{_name(data, line)}, {line['said']}"
 
 
 _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
@@ -125,9 +127,9 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         _bodies,
         "Coloured: the prediction, by its error in mm. Blue lines: the full-order reference. "
         "Grey lines: the body at rest. The arrow shows place and direction of the force. "
-        "Worst: the test load with the largest mean error e of that method. Typical: with the "
-        "median one. Two methods can thus show different loads, and the load with the largest "
-        "relative error may be another one. "
+        "Above each view: the largest error at a node and the relative L2 error of the drawn load. "
+        "Each method shows the test load with its own largest, or median, mean error e. Two "
+        "methods can thus show different loads, and the largest relative error may be at another. "
         "Drag to turn, scroll to zoom; both views turn together. By keyboard: Tab to a view, then "
         "arrow keys, + and −, or Home. Errors beyond half the body's size are cut.",
     ),
@@ -159,7 +161,7 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         "Core-seconds of training data, fit and queries, for the fastest configuration of each "
         "method that is accurate enough. First chart: total over the number of queries; a "
         "diamond marks the break-even with the full-order model. Second: its parts for one number "
-        "of queries.",
+        "of queries, at first near the first break-even, in core-seconds or as shares.",
     ),
     "singular": (
         "Singular values of the training snapshots",

@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 
-from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.entries import Entry, dataset_names, entries_of, most_accurate, verdict_of
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.page_sections import View
-from mor_bench.report.short_names import renamed
+from mor_bench.report.verdict_words import in_words, needs_in_words
 
 Link = tuple[str, str]
 """Address and text."""
@@ -52,8 +51,8 @@ def standings(view: View, files: Mapping[str, Mapping[str, str]]) -> Standings:
     datasets, columns = [], []
     for name in dataset_names(comparison):
         verdict = verdict_of(view.analysis, name).get("headline", "No configuration was run.")
-        finding = renamed(verdict, view.names[name]).partition(". ")[2] or verdict
-        needs = needs_text(needs_of(comparison, name))
+        finding = in_words(verdict, view.names[name]).partition(". ")[2] or verdict
+        needs = needs_in_words(needs_of(comparison, name))
         datasets.append(((files["dataset"][name], name), needs, finding))
         columns.append(entries_of(comparison, name, view.analysis))
     methods = [

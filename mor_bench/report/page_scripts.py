@@ -13,7 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from mor_bench.report.number_format import joined_units
+from mor_bench.report.number_format import unbroken
 from mor_bench.results.json_file import without_nan
 from mor_bench.snapshots.store import make_own_folder, write_atomically
 
@@ -82,7 +82,7 @@ def _policy(scripts: str, styles: str) -> str:
 def embedded_json(content: Any) -> Markup:
     """Return JSON that cannot end its script element; NaN and infinity become null.
 
-    Numbers stay beside their units.
+    Numbers stay beside their units, and intervals whole.
     """
     text = json.dumps(_nulls(content), separators=(",", ":"), allow_nan=False)
     for letter in "<>&":
@@ -94,7 +94,7 @@ def _nulls(value: Any) -> Any:
     if isinstance(value, float):
         return value if isinstance(without_nan(value), float) else None
     if isinstance(value, str):
-        return joined_units(value)
+        return unbroken(value)
     if isinstance(value, dict):
         return {_nulls(key): _nulls(item) for key, item in value.items()}
     return [_nulls(item) for item in value] if isinstance(value, list | tuple) else value

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.told import is_observed
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.canvas import Drawn
 from mor_bench.report.details import dataset_details, hard_cases
 from mor_bench.report.entries import Analysis, Entry, entries_of, verdict_of
 from mor_bench.report.hardest_loads import hardest_loads
+from mor_bench.report.not_measured import unmeasured
 from mor_bench.report.number_format import explain_short_names, percent
 from mor_bench.report.page_data import Shown, cells_of, payload, reading_order
 from mor_bench.report.page_facts import (
@@ -34,6 +34,7 @@ from mor_bench.report.short_names import ShortName, constants, renamed
 from mor_bench.report.speed_tables import target_table
 from mor_bench.report.summary import interval_basis, notes_of, warnings_of
 from mor_bench.report.text_table import TextTable, with_information, with_short_names
+from mor_bench.report.verdict_words import needs_in_words
 from mor_bench.report.whole_cost import costs_of
 from mor_bench.results.comparison import Comparison
 
@@ -55,7 +56,8 @@ class Section:
     `rows` are the entries with their short names, cells, and whether they qualify. `constants` are
     parameters that do not vary. `given` is what every method gets. `events` are failures, doubts
     and warnings other than unstable timings, which are `unsteady`. `methods` are facts about each.
-    `hard` are tables about difficult loads, `targets` and `details` all further tables.
+    `unmeasured` lists what a full comparison adds. `hard` are tables about difficult loads,
+    `details` all further tables.
     `body_picture` replaces the turning bodies on paper. `worst` describes the worst test loads by
     label, and `faster` is the title of the table of pairs. `protocol` says how all was measured.
     `data` is the content for the scripts.
@@ -78,6 +80,7 @@ class Section:
     failures: list[Event]
     events: list[Event]
     unsteady: list[Event]
+    unmeasured: list[str]
     hard: list[TextTable]
     details: list[TextTable]
     methods: list[tuple[str, list[tuple[str, str]]]]
@@ -140,7 +143,7 @@ def section_of(view: View, dataset: str) -> Section:
         limits=limits_of(comparison, analysis, entries),
         card=verdict,
         given="observed displacements" if is_observed(comparison, dataset) else "nodal forces (N)",
-        needs=needs_text(needs).replace("<=", "≤"),
+        needs=needs_in_words(needs),
         frontier=frontier(data, _frontier_title(verdict)),
         charts=charts(data),
         rows=[
@@ -157,6 +160,7 @@ def section_of(view: View, dataset: str) -> Section:
         failures=[Event(names[e.label], e.trouble) for e in entries if e.trouble],
         events=_events(view, dataset, entries),
         unsteady=[Event(names[e.label], "; ".join(e.unstable)) for e in entries if e.unstable],
+        unmeasured=unmeasured(comparison, dataset, entries),
         hard=_complete(hard, entries, named),
         details=_complete(tables, entries, named),
         methods=[

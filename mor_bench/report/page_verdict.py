@@ -9,7 +9,7 @@ from typing import Any
 
 from mor_bench.report.entries import Entry, most_accurate
 from mor_bench.report.number_format import DASH, number, percent, span, whole
-from mor_bench.report.short_names import renamed
+from mor_bench.report.verdict_words import NO_RUNNER_UP, RUNNER_UP, in_words
 from mor_bench.report.whole_cost import Costs
 
 MESH_MEANING = (
@@ -110,7 +110,7 @@ def card(
             _by_latency(qualified, verdict["runner_up"], undecided, names, (entries, known)),
             _by_offline(qualified, verdict["cheapest"], names),
         ]
-    headline = renamed(verdict["headline"], names)
+    headline = in_words(verdict["headline"], names)
     return Card(
         rankings,
         rankings[0].title if rankings else headline.split(". ", 1)[-1],
@@ -118,8 +118,8 @@ def card(
         mesh,
         stability,
         command,
-        [renamed(sentence, names) for sentence in sentences],
-        [renamed(line, names) for line in verdict["evidence"]],
+        [in_words(sentence, names) for sentence in sentences],
+        [in_words(line, names) for line in verdict["evidence"]],
     )
 
 
@@ -164,13 +164,14 @@ def _by_latency(
     first = qualified[0]
     second = next((e for e in qualified if e.label == runner_up), None)
     picks = [_pick("fastest", first, names)]
-    picks += [_pick("runner-up of another method", second, names)] if second else []
+    picks += [_pick(RUNNER_UP, second, names)] if second else []
     if undecided:
         sentence = f"Its latency cannot be told apart from that of {listed(undecided)}."
     elif len(qualified) > 1:
         sentence = "It is faster than every other configuration that qualifies."
     else:
         sentence = "No other configuration qualifies."
+    sentence += f" {NO_RUNNER_UP}" if second is None and len(qualified) > 1 else ""
     full_order = [e for e in qualified if e.row.reference]
     full_order = full_order or [e for e in entries if e.row.reference and e.ran]
     if full_order and not first.row.reference:
@@ -232,7 +233,7 @@ def _by_offline(
     first = next((e for e in qualified if e.label == cheapest), ordered[0])
     second = next((e for e in ordered if e.method != first.method), None)
     picks = [_pick("cheapest offline", first, names)]
-    picks += [_pick("next of another method", second, names)] if second else []
+    picks += [_pick(RUNNER_UP, second, names)] if second else []
     sentence = (
         "Offline cost: core-seconds of training data and fit. Repeated fits differ, so costs "
         "are compared with two digits; the order of fits of less than a second is partly chance."
@@ -260,7 +261,7 @@ def _error_tail(entry: Entry) -> str:
     p95, worst = (entry.figure("error", name) for name in ("rel_l2_p95", "rel_l2_max"))
     if p95 is None or worst is None:
         return ""
-    return f"19 of 20 test loads: at most {percent(p95)} %; worst: {percent(worst)} %"
+    return f"19 of 20 test loads: ≤ {percent(p95)} %; largest relative error: {percent(worst)} %"
 
 
 def _latency_tail(entry: Entry) -> str:

@@ -1,4 +1,9 @@
-"""The middle and the two worst test loads of a configuration, in words."""
+"""The middle and the worst test loads of a configuration, in words.
+
+"Worst" has three meanings, and the loads often differ: the largest relative error, which is large
+where a body hardly moves; the largest error in mm at a node; and the largest mean error e, by which
+a run stores the load that the bodies show. Each text says which of them it means.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.report.number_format import number, percent
+from mor_bench.report.verdict_words import ERROR
 
 NEEDED = {"relative_l2", "max_nodal_m", "amplitude_m"}
 """Names of the raw samples that the sentences need."""
 
+LOAD_OF_KIND = {
+    "worst": "the test load with its largest mean error e",
+    "typical": "the test load with its median mean error e",
+}
+"""What the stored samples are, by their kind."""
+
 
 def worst_cases(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
-    """Describe the middle load, and those with the largest relative and absolute errors.
+    """Describe the middle load, and those with the largest relative, nodal and mean errors.
 
-    The two worst loads often differ: relative errors are large where a body hardly moves.
     Empty without raw samples, or if a load has no prediction.
     """
     if not set(arrays) >= NEEDED:
@@ -30,13 +41,20 @@ def worst_cases(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
         return []
     i, j = int(np.argmax(relative)), int(np.argmax(nodal))
     small = "a small load, " if moved[i] < np.median(moved) / 2 else ""
-    return [
+    said = [
         f"Middle (medians): {percent(float(np.median(relative)))} %, "
         f"{_mm(np.median(nodal))} at the worst node, moves {_mm(np.median(moved))}.",
-        f"Worst relative: {percent(float(relative[i]))} % ({small}moves {_mm(moved[i])}).",
-        f"Worst absolute: {_mm(nodal[j])} at a node ({percent(float(relative[j]))} %, "
-        f"moves {_mm(moved[j])}).",
+        f"Largest {ERROR} of all test loads: {percent(float(relative[i]))} % "
+        f"({small}test load {i}, moves {_mm(moved[i])}).",
+        f"Largest error in mm: {_mm(nodal[j])} at a node (test load {j}, "
+        f"{percent(float(relative[j]))} %, moves {_mm(moved[j])}).",
     ]
+    if "mean_dof_m" in arrays:
+        k = int(np.argmax(arrays["mean_dof_m"]))
+        others = {i: "the one with the largest relative error", j: "the one with the largest in mm"}
+        figures = f"test load {k} ({_mm(nodal[k])} at a node, {percent(float(relative[k]))} %)"
+        said.append(f"Largest mean error e, drawn under Deformed bodies: {others.get(k, figures)}.")
+    return said
 
 
 def _mm(length_m: np.floating[Any] | float) -> str:

@@ -121,7 +121,7 @@ def against_the_paper(dataset: str, entries: Sequence[Entry]) -> TextTable | Non
         "with the largest e and for the one with the largest displacement. "
     )
     headings = ["configuration", "largest u (m)", "ē (m)", "ē, free dofs (m)"]
-    headings += ["ē / largest u (%)", "median rel. L2 (%)", "slope", "slope / paper's"]
+    headings += ["ē / largest u (%)", "median relative L2 error (%)", "slope", "slope / paper's"]
     headings += ["tip at largest e (%)", "tip at largest u (%)"]
     note += " ".join([*REMARKS.get(scene_of(dataset), ()), SELECTED_ON_TEST])
     rows = [first, *(_against(entry, paper.slope) for entry in best)]

@@ -137,5 +137,5 @@ def discretisation_error(entries: Sequence[Entry]) -> str:
         return "not known"
     least = "at least " if row.discretisation_at_least else ""
     relative = row.discretisation_rel_l2
-    beside = "" if relative is None else f", relative L2 (median) {percent(relative)} %"
+    beside = "" if relative is None else f", relative L2 error {percent(relative)} % (median)"
     return f"{least}{metres(row.discretisation_error_m)} m{beside}; {MESH_NOTE}"

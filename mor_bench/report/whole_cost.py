@@ -34,7 +34,8 @@ PARTS = {"training data": "#2878b5", "fit": "#d98a29", "queries": "#a6a6a6"}
 CAPTION = (
     "Core-seconds of training data, fit and queries, for the fastest configuration of each method "
     "that is accurate enough. Above: the total over the number of queries; a diamond marks the "
-    "break-even with the full-order model. Below: the parts of the total. "
+    "break-even with the full-order model. Below: the parts of the total near the first "
+    "break-even. "
     "An arrow leads to a value beyond the axis."
 )
 
@@ -79,10 +80,23 @@ class Costs:
         )
 
     @property
-    def queries(self) -> int:
-        """The number of queries of the bars: a power of ten beyond most break-even points."""
+    def most_queries(self) -> int:
+        """The end of the axis: a power of ten beyond most break-even points."""
         most = max((line.break_even or 1 for line in self.lines), default=1)
         return int(10 ** min(ceil(log10(max(most, 1))) + 1, 9))
+
+    @property
+    def queries(self) -> int:
+        """The number of queries of the bars: a power of ten at which all parts can be seen.
+
+        It is the one next to the first break-even, where what a method saves in queries is as much
+        as its data and fit cost. Without one, queries of a typical line cost as much as these.
+        """
+        paid = [float(line.break_even) for line in self.lines if line.break_even]
+        offline = [line for line in self.lines if line.data + line.fit > 0 and line.query > 0]
+        equal = [(line.data + line.fit) / line.query for line in offline]
+        n = min(paid) if paid else float(np.median(equal)) if equal else 1.0
+        return int(10 ** min(max(round(log10(max(n, 1.0))), 0), 9))
 
 
 def costs_of(
@@ -135,7 +149,7 @@ def whole_cost(comparison: Comparison, dataset: str, analysis: Analysis) -> Pict
 def draw_totals(axes: Axes, costs: Costs) -> None:
     """Draw the total over the number of queries, and a diamond at each break-even."""
     dress(axes)
-    counts = np.geomspace(1, costs.queries, 60)
+    counts = np.geomspace(1, costs.most_queries, 60)
     notes, curves, marks = [], [], []
     for line in costs.lines:
         style, y = style_of(line.method), np.array([line.total(n) for n in counts])
@@ -151,7 +165,7 @@ def draw_totals(axes: Axes, costs: Costs) -> None:
         beside = ((-8, 6), (-8, -6), (8, 6), (8, -6), (0, 7), (0, -7))
         name = shortened(line.name, 30)
         notes.append(Note(name, places, readable(style.colour), "bold", beside))
-    powers = range(round(log10(costs.queries)) + 1)
+    powers = range(round(log10(costs.most_queries)) + 1)
     axes.set_xticks([10**n for n in powers], [_power(n) for n in powers])
     axes.set_xticks([], minor=True)
     log_ticks(axes.yaxis, axes.get_ylim())

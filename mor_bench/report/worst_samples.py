@@ -35,6 +35,7 @@ from mor_bench.report.number_format import number, percent
 from mor_bench.report.projection import View, normals
 from mor_bench.report.rendering import WIRE, Look, Shot, show_shots
 from mor_bench.report.short_names import short_names
+from mor_bench.report.verdict_words import ERROR
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.mesh import Mesh
 
@@ -137,8 +138,9 @@ def _draw(
     arrows = [_arrow(mesh, sample) for sample in samples]
     limits = _limits(mesh, samples, arrows)
     tall = float(np.divide(*np.diff(limits, axis=0)[0, ::-1]))
-    subject = f"{dataset}: the worst test sample of each method, coloured by its error"
-    height = 0.95 + rows * (0.5 + WIDTH_IN / columns * min(tall, 1.0))
+    subject = f"{dataset}: of each method the test load with its largest mean error e, "
+    subject += "coloured by the error of each node"
+    height = 0.95 + rows * (0.66 + WIDTH_IN / columns * min(tall, 1.0))
     figure = new_figure(height, _finding(samples), subject)
     grid = figure.subplots(rows, columns, squeeze=False)
     high = uncut([s.largest_m for s in samples])[1]
@@ -191,7 +193,7 @@ def _finding(samples: list[WorstSample]) -> str:
         return "No method predicts its worst sample"
     least, most = answered[0], answered[-1]
     unit, per_m = length_unit(most.largest_m)
-    text = f"On its worst sample, {shortened(least.entry.method, 30)} errs by up to "
+    text = f"Where its mean error e is largest, {shortened(least.entry.method, 30)} errs by up to "
     text += f"{number(per_m * least.largest_m)} {unit}"
     if least is most:
         return text
@@ -258,8 +260,8 @@ def _write_panel(
     figures = "no prediction: the method failed on it"
     if np.isfinite(sample.prediction).all(axis=1).any():
         unit, per_m = length_unit(sample.largest_m)
-        figures = f"up to {number(per_m * sample.largest_m)} {unit}, "
-        figures += f"rel. L2 {percent(sample.relative_l2)} %"
+        figures = f"up to {number(per_m * sample.largest_m)} {unit}"
+        figures += f"\n{ERROR} {percent(sample.relative_l2)} %"
         if sample.entry.n_failed:
             figures += f"; {sample.entry.n_failed} failed"
     if arrow is not None:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from mor_bench.analysis.analyse import verdict_on
 from mor_bench.analysis.told import told_at_most
-from mor_bench.analysis.verdict import Requirements, Verdict
+from mor_bench.analysis.verdict import Requirements, Verdict, needs_of
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.compare import run
 from mor_bench.runs.listener import Listener
-from mor_bench.specs import AnyDatasetSpec, load_dataset_spec
+from mor_bench.specs import AnyDatasetSpec, list_suite, load_dataset_spec
 from mor_bench.specs.method_spec import Told
 
-__all__ = ["Verdict", "newest_run", "pick"]
+__all__ = ["Verdict", "newest_run", "pick", "run_folder"]
 
 RUNS = Path("reports") / "runs"
 
@@ -36,7 +37,8 @@ def pick(
     Parameters
     ----------
     dataset : str, Path or dict
-        A name in ``datasets/``, the path of a TOML, or its content.
+        A name in ``datasets/``, the path of a TOML, or its content. Also the folder of a run of one
+        dataset: its stored results are the evidence, and its stored needs the default limits.
     comparison : Comparison or path, optional
         Comparison to choose from, or the folder of a run. By default the newest finished run
         of the dataset under ``reports/runs``. If there is none, `mor_bench.run` compares the
@@ -54,7 +56,8 @@ def pick(
     Raises
     ------
     InvalidInputError
-        If a limit is not positive, or the comparison does not hold this dataset.
+        If a limit is not positive, the comparison does not hold this dataset, or a folder holds
+        several.
     SpecError, StoreError
         If the dataset is not valid, or the run's folder cannot be read or lacks raw samples.
 
@@ -68,26 +71,70 @@ def pick(
     ...     [row.label for row in verdict.qualified]
     ['linear-fem']
     """
-    spec = load_dataset_spec(dataset, suite)
     given = {name: limit for name, limit in limits.items() if limit is not None}
     unknown = given.keys() - Requirements.__dataclass_fields__.keys()
     if unknown:
         names = ", ".join(Requirements.__dataclass_fields__)
         raise InvalidInputError(f"unknown limit `{min(unknown)}`; limits: {names}.")
-    needs = {"error": spec.needs.error, "latency_ms": spec.needs.latency_ms}
-    requirements = Requirements(**{**needs, **given})
-    if comparison is None:
-        evidence = newest_run(spec) or run([dataset], cache=cache, suite=suite, listener=listener)
-    elif isinstance(comparison, Comparison | str | Path):
-        evidence = comparison if isinstance(comparison, Comparison) else Comparison.read(comparison)
-        _check_evidence(evidence, spec)
+    if (folder := run_folder(dataset, suite)) is not None:
+        evidence, name = _stored(folder, comparison)
+        requirements = Requirements(**{**needs_of(evidence, name).asked, **given})
     else:
+        spec = load_dataset_spec(dataset, suite)
+        name, needs = spec.name, {"error": spec.needs.error, "latency_ms": spec.needs.latency_ms}
+        requirements = Requirements(**{**needs, **given})
+        there = _given(comparison, spec) or newest_run(spec)
+        evidence = there or run([dataset], cache=cache, suite=suite, listener=listener)
+    evidence.check_samples(name)
+    return verdict_on(told_at_most(evidence, told), name, requirements)
+
+
+def run_folder(source: str | Path | Mapping[str, Any], suite: Path | None = None) -> Path | None:
+    """Return the folder of a run, or of one in ``reports/runs``; None if a dataset is meant.
+
+    A dataset of the suite goes before a folder of the same name.
+    """
+    if not isinstance(source, str | Path):
+        return None
+    own = list_suite("datasets", suite) if suite is not None else {}
+    if str(source) in {**list_suite("datasets"), **own}:
+        return None
+    for folder in (Path(source), RUNS / source):
+        with suppress(OSError):  # a name may be too long for a file
+            if (folder / "results.json").is_file():
+                return folder
+    return None
+
+
+def _stored(folder: Path, comparison: object) -> tuple[Comparison, str]:
+    """Read a run, and name its only dataset."""
+    if comparison is not None:
+        raise InvalidInputError(
+            f"{folder}: the folder of a run is the evidence itself; give the name of its dataset "
+            "to use another run."
+        )
+    evidence = Comparison.read(folder)
+    names = list(evidence.datasets)
+    if len(names) != 1:
+        held = ", ".join(names) or "no dataset"
+        raise InvalidInputError(
+            f"{folder} has results for {held}; name one: `mor-bench pick DATASET --run {folder}`."
+        )
+    return evidence, names[0]
+
+
+def _given(comparison: Comparison | str | Path | None, spec: AnyDatasetSpec) -> Comparison | None:
+    """Return the given comparison, which must hold this dataset; None if none is given."""
+    if comparison is None:
+        return None
+    if not isinstance(comparison, Comparison | str | Path):
         raise InvalidInputError(
             "`comparison` must be a Comparison or the folder of a run; "
             f"got {type(comparison).__name__}."
         )
-    evidence.check_samples(spec.name)
-    return verdict_on(told_at_most(evidence, told), spec.name, requirements)
+    evidence = comparison if isinstance(comparison, Comparison) else Comparison.read(comparison)
+    _check_evidence(evidence, spec)
+    return evidence
 
 
 def _holds(comparison: Comparison, spec: AnyDatasetSpec) -> bool:

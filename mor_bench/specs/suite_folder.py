@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mor_bench import checked_files
-from mor_bench.errors import RenamedWarning, SpecError
+from mor_bench.errors import RenamedWarning, SpecError, UnknownNameError
 from mor_bench.specs.one_line_errors import nearest_name
 
 Kind = Literal["datasets", "methods"]
@@ -76,9 +76,12 @@ def find_file(kind: Kind, source: str | Path, suite: Path | None) -> Path:
         warnings.warn(f"`{source}` is now `{name}`. {note}", RenamedWarning, stacklevel=3)
         source = name
     if source not in known:
-        raise SpecError(
+        raise UnknownNameError(
             f"unknown {kind[:-1]} {source!r}{nearest_name(source, known)} "
-            f"Known: {', '.join(known)}."
+            "`mor-bench list` shows the names.",
+            kind=kind,
+            name=source,
+            known=known,
         )
     return known[source]
 

@@ -4,7 +4,11 @@ Report.kinds.bodies = (figure, data) => {
   const R = Report;
   const found = data.bodies;
   const views = R.pair(figure);
-  for (const view of views) view.before(document.createElement("p"));
+  for (const view of views) {
+    const caption = document.createElement("p");
+    caption.className = "caption";
+    view.before(caption);
+  }
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer;
   const unpacked = ({ scale, data: text }) => Float32Array.from(new Int16Array(bytes(text)), (v) => v * scale);
   const points = unpacked(found.points);
@@ -15,7 +19,8 @@ Report.kinds.bodies = (figure, data) => {
   const methods = R.options(data, kinds.includes("worst")
     ? found.samples.filter((s) => s.kind === "worst") : found.samples);
   const redraw = () => show();
-  const kind = R.choice(figure, "test load", kinds.map((k) => [k, `${k} by mean error e`]), redraw);
+  const ranks = { worst: "with the largest mean error e", typical: "with the median mean error e" };
+  const kind = R.choice(figure, "test load", kinds.map((k) => [k, ranks[k]]), redraw);
   const chosen = [
     R.choice(figure, "left", methods, redraw), R.choice(figure, "right", methods, redraw),
   ];
@@ -121,7 +126,7 @@ Report.kinds.bodies = (figure, data) => {
 
   function one(view, select, drawn, box) {
     const sample = sampleOf(select);
-    const text = sample ? sample.text : "no finite prediction of this load";
+    const text = sample ? sample.caption : "no finite prediction";
     view.previousElementSibling.textContent = `${R.nameOf(data, select.value)}: ${text}`;
     return R.draw(view, drawn, R.layout({
       height: R.isNarrow() ? 300 : 400, margin: { l: 0, r: 0, t: 8, b: 0 },
@@ -146,7 +151,7 @@ Report.kinds.bodies = (figure, data) => {
     out.value = `× ${Number(factor.value).toFixed(1)}`;
     if (R.state.printing) return Promise.resolve();
     const left = sampleOf(chosen[0]);
-    if (left) R.say(figure, `${R.nameOf(data, left.label)}, ${left.kind} test load by e: ${left.text}`);
+    if (left) R.say(figure, `${R.nameOf(data, left.label)}, ${left.said}`);
     // One colour scale for both, so that equal colours are equal errors.
     const shown = chosen.map(sampleOf).filter(Boolean);
     const largest = Math.max(...shown.flatMap((s) => sizes(unpacked(s.error))));

@@ -9,7 +9,7 @@ Report.kinds.distributions = (figure, data) => {
     const line = R.winnerOf(data, lines), row = R.rowOf(data, line.label);
     const { p95, max } = row[kind.value], name = R.nameOf(data, line.label);
     return kind.value === "error"
-      ? `${name}: 95 % of the test loads have an error below ${R.short(p95)} %, the worst has ${R.short(max)} %`
+      ? `${name}: 95 % of the test loads have a relative L2 error below ${R.short(p95)} %, the largest is ${R.short(max)} %`
       : `${name}: 95 % of the queries take less than ${R.short(p95)} ms, the slowest ${R.short(max)} ms`;
   }
   function show() {
@@ -106,7 +106,7 @@ Report.kinds.positions = (figure, data) => {
     const logs = known.map((i) => Math.log10(map.error[i]));
     const [low, high] = [Math.min(...logs), Math.max(...logs)];
     const worst = known.reduce((a, b) => (map.error[b] > map.error[a] ? b : a));
-    R.say(figure, `${R.nameOf(data, map.label)}: ${R.short(10 ** low)} to ${R.short(10 ** high)} %, ` +
+    R.say(figure, `${R.nameOf(data, map.label)}: median relative L2 error ${R.short(10 ** low)} to ${R.short(10 ** high)} %, ` +
       `largest where the load acts around (${found.centres[worst].join(", ")}) m`);
     const ticks = [0, 0.25, 0.5, 0.75, 1].map((t) => low + t * (high - low));
     const at = (i) => `(${found.centres[i].join(", ")}) m`;
@@ -215,6 +215,7 @@ Report.kinds.costs = (figure, data) => {
 
   const out = document.createElement("output");
   number.after(out);
+  const scale = R.choice(figure, "bars in", [["seconds", "core-seconds"], ["shares", "shares of the total (%)"]], () => parts());
   const total = (line, n) => line.data + line.fit + n * line.query;
 
   function totals() {
@@ -243,40 +244,46 @@ Report.kinds.costs = (figure, data) => {
   }
 
   function parts() {
-    const n = 10 ** Number(number.value);
-    const count = (10 ** Number(number.value)).toLocaleString("en-US");
+    const n = 10 ** Number(number.value), shares = scale.value === "shares";
+    const count = n.toLocaleString("en-US");
     out.value = count;
     const named = lines.map((line) => R.plain(R.nameOf(data, line.label)));
     const sums = lines.map((line) => total(line, n)).sort((a, b) => a - b);
     // One costly method must not hide the others: the axis ends, and the bar gets its value.
-    const end = 1.15 * Math.min(sums.at(-1), 4 * sums[Math.floor((sums.length - 1) / 2)]);
-    const { ink, fitted, reference, rest } = R.theme();
+    const end = shares ? 100 : 1.15 * Math.min(sums.at(-1), 4 * sums[Math.floor((sums.length - 1) / 2)]);
+    const { ink, paper, fitted, reference, rest } = R.theme();
     // The library has no bars: wide lines from the end of one part to the end of the next.
     const begun = lines.map(() => 0);
     const part = (name, value, colour) => {
       const [x, y, hovertext] = [[], [], []];
       lines.forEach((line, i) => {
-        const from = begun[i];
-        begun[i] += value(line);
+        const from = begun[i], share = (100 * value(line)) / total(line, n);
+        begun[i] += shares ? share : value(line);
         x.push(from, begun[i], null);
         y.push(named[i], named[i], null);
-        const text = R.hover([R.nameOf(data, line.label), `${name}: ${R.short(value(line))} core-s`]);
+        const text = R.hover([R.nameOf(data, line.label),
+          `${name}: ${R.short(value(line))} core-s, ${R.short(share)} % of ${R.short(total(line, n))}`]);
         hovertext.push(text, text, "");
       });
       return { type: "scatter", mode: "lines", name, x, y, hovertext, hoverinfo: "text",
         line: { width: 22, color: colour } };
     };
-    const cut = lines.filter((line) => total(line, n) > end).map((line) => ({
-      y: R.plain(R.nameOf(data, line.label)), x: end, xanchor: "right", showarrow: false,
-      text: `${R.short(total(line, n))} →`, bgcolor: R.theme().paper, font: { size: 12, color: ink },
-    }));
+    const note = (line, more) => ({ y: R.plain(R.nameOf(data, line.label)), showarrow: false,
+      bgcolor: paper, font: { size: 12, color: ink }, ...more });
+    const notes = shares
+      ? lines.map((line) => note(line, { x: 101, xanchor: "left", text: `${R.short(total(line, n))} core-s` }))
+      : lines.filter((line) => total(line, n) > end).map((line) =>
+        note(line, { x: end, xanchor: "right", text: `${R.short(total(line, n))} →` }));
+    const axis = shares
+      ? R.axis("share of the total (%)", { range: [0, R.isNarrow() ? 150 : 125], tickvals: [0, 25, 50, 75, 100] })
+      : R.axis("core-seconds", { range: [0, end] });
     return R.draw(right, [
       part("training data", (l) => l.data, reference),
       part("fit", (l) => l.fit, fitted),
       part(`${count} queries`, (l) => n * l.query, rest),
     ], R.layout({
-      height: 440, xaxis: R.axis("core-seconds", { range: [0, end] }),
-      yaxis: R.axis("", { range: [lines.length - 0.4, -0.6], type: "category", tickformat: "" }), annotations: cut,
+      height: 440, xaxis: axis,
+      yaxis: R.axis("", { range: [lines.length - 0.4, -0.6], type: "category", tickformat: "" }), annotations: notes,
       legend: { orientation: "h", y: -0.2, font: { size: 12 } },
     }));
   }

@@ -61,6 +61,54 @@ Report.kinds.frontier = (figure, data) => {
     return found;
   }
 
+  // On a phone names have no room: the front and the winner get numbers, which a list explains.
+  const AROUND = [1, 1.7, 2.5, 3.4].flatMap((far) => [
+    [13, 12], [-13, 12], [13, -12], [-13, -12], [0, 18], [0, -18], [19, 0], [-19, 0],
+  ].map(([dx, dy]) => [far * dx, far * dy]));
+  const list = document.createElement("ol");
+  list.className = "numbers";
+  list.hidden = true;
+  list.setAttribute("aria-label", "Numbers in the chart: the Pareto front and the winner");
+  plot.after(list);
+
+  const listed = (rows) => rows.filter((row) => row.front || row.label === data.winner)
+    .sort((a, b) => x(a) - x(b) || y(a) - y(b));
+
+  function numbers(front, rows, range, taken) {
+    const markers = rows.map((row) => boxAt(pixels(row, range), 12, 12));
+    return front.flatMap((row, i) => {
+      if (y(row) !== inside(y(row))) return [];
+      const [px, py] = pixels(row, range), text = String(i + 1), width = R.widthOf(text, 13) + 8;
+      const places = AROUND.map(([dx, dy]) => {
+        const box = boxAt([px + dx, py + dy], width, 18);
+        return { dx, dy, box, covered: markers.filter((marker) => overlap(box, marker)).length };
+      }).filter(({ box }) => box[0] >= 0 && box[1] >= 0 && box[2] <= size[0] && box[3] <= size[1]
+        && !taken.some((other) => overlap(box, other)));
+      if (!places.length) return [];
+      const best = places.reduce((a, b) => (b.covered < a.covered ? b : a));
+      taken.push(best.box);
+      return [{
+        x: Math.log10(x(row)), y: Math.log10(y(row)), ax: best.dx, ay: -best.dy, text,
+        arrowhead: 0, arrowwidth: 1, standoff: 6, arrowcolor: R.theme().quiet,
+        bgcolor: R.theme().paper, borderpad: 0,
+        font: { size: 13, color: R.textColourOf(R.styleOf(data, row)) },
+      }];
+    });
+  }
+
+  function explain(front) {
+    const unit = time.value === "work" ? "multiply-adds" : "ms";
+    list.hidden = !front.length;
+    list.replaceChildren(...front.map((row) => {
+      const item = document.createElement("li"), name = document.createElement("b");
+      name.textContent = row.name;
+      name.style.color = R.textColourOf(R.styleOf(data, row));
+      item.append(name, `: ${R.short(y(row))}\u00a0%, ${R.short(x(row))}\u00a0${unit}`,
+        row.label === data.winner ? " (winner)" : "");
+      return item;
+    }));
+  }
+
   // What is plotted comes first; the medians follow if they are not what is plotted.
   function hoverOf(row) {
     const [name, medianError, medianLatency, ...rest] = row.hover;
@@ -103,7 +151,7 @@ Report.kinds.frontier = (figure, data) => {
     };
   }
 
-  function front(rows) {
+  function steps(rows) {
     const sorted = [...rows].sort((a, b) => x(a) - x(b) || y(a) - y(b));
     const best = [];
     for (const row of sorted) {
@@ -147,11 +195,12 @@ Report.kinds.frontier = (figure, data) => {
 
   // Values beyond the axis stand at its edge, with an arrow and the value. Such a label covers no
   // text in `taken`, and markers only where there is no other place; without a place it is left out.
-  function cuts(rows, range, taken) {
+  function cuts(rows, range, taken, front) {
     const markers = rows.map((row) => boxAt(pixels(row, range), 12, 12));
     return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).flatMap((row) => {
       const value = `${R.short(y(row))} %`;
-      const text = R.isNarrow() ? value : `${row.name}: ${value}`;
+      const text = !R.isNarrow() ? `${row.name}: ${value}`
+        : front.includes(row) ? `${front.indexOf(row) + 1}: ${value}` : value;
       const side = y(row) > TOP ? 1 : -1, [px, py] = pixels(row, range), width = R.widthOf(text, 11) + 6;
       const places = AWAY.flatMap((away) => BESIDE.map((part) => {
         const shift = part * width;
@@ -204,20 +253,23 @@ Report.kinds.frontier = (figure, data) => {
     const { shapes, annotations } = marks(range);
     const taken = annotations.filter((note) => note.yref !== "paper")
       .map((note) => [0, 0, R.widthOf(note.text, 12) + 6, 19]);
-    const traces = [], named = labelled(visible, range, taken);
+    const front = R.isNarrow() ? listed(visible) : [];
+    const traces = [], named = R.isNarrow() ? new Set() : labelled(visible, range, taken);
+    const counted = numbers(front, visible, range, taken);
+    explain(front);
     for (const group of data.groups) {
       const mine = rows.filter((row) => row.group === group);
       for (const method of new Set(mine.map((row) => row.method))) {
         traces.push(trace(mine.filter((row) => row.method === method), group, named));
       }
     }
-    traces.push(front(rows));
+    traces.push(steps(rows));
     const title = time.value === "work" ? "multiply-adds of one query"
       : `latency of one query, ${time.selectedOptions[0].text.split(", ")[1]} (ms)`;
     const its = R.layout({
       xaxis: time.value === "work" ? R.countAxis(title, range.x) : R.logAxis(title, { range: range.x }),
       yaxis: R.logAxis(`relative L2 error, ${error.selectedOptions[0].text} (%)`, { range: range.y }),
-      shapes, annotations: [...annotations, ...cuts(visible, range, taken)],
+      shapes, annotations: [...annotations, ...counted, ...cuts(visible, range, taken, front)],
       ...R.legend(traces.length + data.groups.length, R.isNarrow() ? 400 : 560),
     });
     its.legend.groupclick = "toggleitem";

@@ -65,9 +65,9 @@ Report.table = (grid, data) => {
     columnHeaderSortMulti: false,
     columns: [
       { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: 150, widthGrow: 3 },
-      { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: 98, ...numbers },
-      { title: "latency (ms)", field: "latency_value", formatter: figureCell("latency"), minWidth: 104, ...numbers },
-      { title: "offline", field: "offline", formatter: figureCell("offline"), minWidth: 84, ...numbers },
+      { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: 126, ...numbers },
+      { title: "latency (ms)", field: "latency_value", formatter: figureCell("latency"), minWidth: 112, ...numbers },
+      { title: "offline (core-s)", field: "offline", formatter: figureCell("offline"), minWidth: 84, ...numbers },
       { title: "told", field: "group", formatter: textCell, minWidth: 150, widthGrow: 2 },
       { title: "qualifies", field: "answer", formatter: textCell, sorter: natural, minWidth: 96 },
     ],
