@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mor_bench.mechanics.stresses import stresses as stresses
     from mor_bench.method_loading import load_method as load_method
     from mor_bench.method_loading import load_surrogate as load_surrogate
+    from mor_bench.reduction.greedy import choose_snapshots as choose_snapshots
     from mor_bench.report.notebook import Comparison as Comparison
     from mor_bench.report.notebook import run as run
     from mor_bench.runs.pick import Verdict as Verdict
@@ -57,6 +58,7 @@ _HOMES = {
     "Stresses": "mor_bench.mechanics.stresses",
     "Surrogate": "mor_bench.surrogate",
     "Verdict": "mor_bench.runs.pick",
+    "choose_snapshots": "mor_bench.reduction.greedy",
     "error_bound": "mor_bench.measure.error_bounds",
     "fit": "mor_bench.runs.single_fit",
     "load_dataset": "mor_bench.snapshots.dataset",

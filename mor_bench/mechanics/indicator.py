@@ -84,18 +84,42 @@ class ErrorIndicator:
         pairs = np.array([self._indicated(*triple) for triple in triples]).reshape(-1, 2)
         return Indication(pairs[:, 0], pairs[:, 1])
 
+    def correction(self, load: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the full-order solve's first correction (n_free,) from u, m.
+
+        It estimates what u lacks. It is not finite if u or the internal forces at u are not.
+
+        Parameters
+        ----------
+        load : (n_free,) float64
+            Forces, N.
+        u : (n_free,) float64
+            Predicted displacements of the free dofs, m.
+        """
+        residual = self._residual(load, u)
+        return self._corrected(residual, u) if np.isfinite(residual).all() else residual
+
     def _indicated(
         self, load: NDArray[np.float64], u: NDArray[np.float64], moved: float
     ) -> tuple[float, float]:
         if not (np.isfinite(u).all() and np.isfinite(moved)):
             return np.inf, np.inf
-        residual = load - self._model.under_load(load).force(u).force
+        residual = self._residual(load, u)
         if not np.isfinite(residual).all():
             return np.inf, np.inf
         if not residual.any() and moved == 0:
             return 0.0, 0.0
-        correction = self._inverse.solve_many([residual], [self._inverse.turned(u)])[0]
+        correction = self._corrected(residual, u)
         return _ratio(residual, load), _ratio(np.append(correction, moved), u)
+
+    def _residual(self, load: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(load - self._model.under_load(load).force(u).force)
+
+    def _corrected(
+        self, residual: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        found = self._inverse.solve_many([residual], [self._inverse.turned(u)])
+        return np.asarray(found[0])
 
 
 def _ratio(part: NDArray[np.float64], whole: NDArray[np.float64]) -> float:

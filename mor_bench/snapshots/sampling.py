@@ -162,11 +162,11 @@ def _drawn_from(
     if k == 1:
         assert chosen is not None
         size, turns = -(-whole // len(chosen)), numbers // len(chosen)
-        designs = [_design(loads.sampling, (loads.seed, int(p)), size, n) for p in patches[:, 0]]
-        unit = np.stack([design[turn] for design, turn in zip(designs, turns, strict=True)])
+        designs = [design(loads.sampling, (loads.seed, int(p)), size, n) for p in patches[:, 0]]
+        unit = np.stack([own[turn] for own, turn in zip(designs, turns, strict=True)])
     else:
-        unit = _design(loads.sampling, (loads.seed,), whole, n)[numbers]
-    forces = _forces(loads, unit[:, : k * d].reshape(len(numbers), k, d), normals)
+        unit = design(loads.sampling, (loads.seed,), whole, n)[numbers]
+    forces = forces_at(loads, unit[:, : k * d].reshape(len(numbers), k, d), normals)
     return PatchLoads(patches, forces, _parameters(sampled, unit[:, k * d :]))
 
 
@@ -231,7 +231,7 @@ def _in_unit_cube(
     if loads.sampling == "random":
         drawn = [np.random.default_rng([loads.seed, int(i)]).uniform(size=d) for i in numbers]
         return np.reshape(drawn, (len(numbers), d))
-    return _design(loads.sampling, (loads.seed,), loads.samples, d)[numbers]
+    return design(loads.sampling, (loads.seed,), loads.samples, d)[numbers]
 
 
 def _combinations(acting: Acting) -> NDArray[np.int64] | None:
@@ -314,7 +314,7 @@ def _random_forces(loads: Drawn, number: int, normals: NDArray[np.float64]) -> N
     generator = np.random.default_rng([loads.seed, number])
     if N_COORDINATES[loads.kind] < 3:
         unit = generator.uniform(size=(1, loads.simultaneous, N_COORDINATES[loads.kind]))
-        return np.asarray(_forces(loads, unit, normals[None])[0])
+        return np.asarray(forces_at(loads, unit, normals[None])[0])
     vectors = np.empty((loads.simultaneous, 3))
     for vector in vectors:
         direction = generator.normal(size=3)
@@ -323,7 +323,7 @@ def _random_forces(loads: Drawn, number: int, normals: NDArray[np.float64]) -> N
 
 
 @lru_cache(maxsize=4096)
-def _design(sampling: Sampling, seed: tuple[int, ...], n: int, d: int) -> NDArray[np.float64]:
+def design(sampling: Sampling, seed: tuple[int, ...], n: int, d: int) -> NDArray[np.float64]:
     """Return n points (n, d) of a space-filling design in the unit cube."""
     from scipy.stats import qmc  # slow to import
 
@@ -335,7 +335,7 @@ def _design(sampling: Sampling, seed: tuple[int, ...], n: int, d: int) -> NDArra
     return np.asarray(qmc.Sobol(d, scramble=True, rng=generator).random_base2(n_bits)[:n])
 
 
-def _forces(
+def forces_at(
     loads: Drawn, unit: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return forces (n, k, 3), N, for coordinates (n, k, d) in [0, 1] and normals (n, k, 3).

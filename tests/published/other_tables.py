@@ -24,6 +24,7 @@ from tests.published.cost_tables import (
 from tests.published.projection_tables import projections, reconstructions
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
+from tests.published.sampling_tables import learning_curves
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
 
 
@@ -355,4 +356,5 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "timed-work": timed_work,
     "projections": projections,
     "reconstructions": reconstructions,
+    "learning-curves": learning_curves,
 }

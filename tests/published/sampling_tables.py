@@ -1,0 +1,52 @@
+"""Tables in Markdown about ways to choose training loads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mor_bench.report.number_format import DASH, number
+from tests.published.run_tables import markdown
+from tests.published.stored import content_of
+
+COMPARED = 320
+"""Number of snapshots whose cost is shown."""
+
+
+def learning_curves(source: str, dataset: str, method: str) -> str:
+    """Show the errors of a method over its number of snapshots, for each way to choose them.
+
+    The figures are medians over the repetitions.
+    """
+    rows = content_of(source)[dataset]["methods"][method]
+    found = {(row["way"], row["n"]): row for row in rows}
+    sizes = sorted({row["n"] for row in rows})
+    base_s = _core_s(found["random", COMPARED])
+    body = []
+    for way in dict.fromkeys(row["way"] for row in rows):
+        cells = [_errors(found.get((way, n))) for n in sizes]
+        core_s = _core_s(found[way, COMPARED])
+        cost = [number(1e3 * core_s / COMPARED), number(core_s / base_s)]
+        body.append([way, *cells, *cost])
+    headings = ["median %; p95 %", *(f"n = {n}" for n in sizes)]
+    headings += [f"core-ms per snapshot, n = {COMPARED}", "over random"]
+    return markdown(headings, body)
+
+
+def _errors(row: Mapping[str, Any] | None) -> str:
+    if row is None:
+        return DASH
+    return "; ".join(_percent(row[name]) for name in ("median", "p95"))
+
+
+def _percent(values: Sequence[float | None]) -> str:
+    middle = float(np.median([np.inf if value is None else value for value in values]))
+    return number(100 * middle) if np.isfinite(middle) else "∞"
+
+
+def _core_s(row: Mapping[str, Any]) -> float:
+    """Return the core-seconds of all snapshots: solves, fits and choices."""
+    parts = np.sum([row[name] for name in ("solve", "fit", "choose")], axis=0)
+    return float(np.median(parts))
