@@ -200,7 +200,8 @@ class _Descent:
         gram = own.sum(axis=0)
         scale = 1.0 / np.sqrt(gram.diagonal())
         normal = gram * scale * scale[:, None] + DEPENDENT * np.eye(len(gram))
-        return -scale[:, None] * cho_solve(cho_factor(normal), scale[:, None] * gradient)
+        solved = cho_solve(cho_factor(normal), scale[:, None] * gradient)
+        return np.asarray(-scale[:, None] * solved)
 
     def enrich(self) -> bool:
         """Add the term that gains most, with X = 0 so far; return False if there is none."""

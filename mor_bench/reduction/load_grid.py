@@ -73,7 +73,7 @@ def interval_rule(n: int) -> tuple[Array, Array]:
     means = np.zeros(n)
     means[0] = 1.0
     weights = np.linalg.solve(legendre.legvander(points, n - 1).T, means)
-    return (points + 1.0) / 2.0, weights
+    return (points + 1.0) / 2.0, np.asarray(weights, dtype=np.float64)
 
 
 def load_grid(scene: Scene, n_rings: int, n_magnitudes: int) -> LoadGrid:
