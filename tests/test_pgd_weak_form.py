@@ -138,7 +138,7 @@ def test_alternating_directions_find_a_residual_of_one_term() -> None:
     """R = K₀X ω P D M on the grid; the gain is half the squared norm of X P D M."""
     weak = weak_of(scene_of(loads={"n_patches": 5}))
     generator = np.random.default_rng(2)
-    force = generator.normal(size=weak.n_free)
+    force = generator.normal(size=(weak.n_free,))
     x = weak.respond(force[None])[0]
     position, direction = generator.normal(size=(5,)), generator.normal(size=(10,))
     true = Term(1, position, direction, np.ones(1))
