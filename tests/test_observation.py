@@ -118,7 +118,7 @@ def test_most_methods_complete_observed_displacements() -> None:
     scene = scene_of({"region": "z-max"})
     for name in QUICK | (set(OBSERVATION_METHODS) - {"umesh"}):  # which needs torch
         assert cheap_method(name, observed=True).supports(scene) is None
-    for name in ("pod", "hpod", "fem-coarse", "hybrid", "pgd"):
+    for name in ("pod", "hpod", "fem-coarse", "hybrid", "pgd-snapshots"):
         assert NO_FORCES in str(cheap_method(name).supports(scene))
 
 

@@ -369,7 +369,17 @@ def test_the_digest_depends_on_physics_only() -> None:
     assert spec.digest() != spec.model_copy(update={"material": stiffer}).digest()
 
 
-def test_a_former_name_of_a_method_is_read_with_a_warning() -> None:
-    with pytest.warns(RenamedWarning, match="`pca-regression-force` is now `pca-regression`"):
-        spec = load_method_spec("pca-regression-force")
-    assert (spec.name, spec.told) == ("pca-regression", "input")
+@pytest.mark.parametrize(
+    ("former", "name", "told"),
+    [
+        ("pca-regression-force", "pca-regression", "input"),
+        ("pgd", "pgd-snapshots", "linear-response"),
+        ("pgd-force", "pgd-snapshots-force", "input"),
+    ],
+)
+def test_a_former_name_of_a_method_is_read_with_a_warning(
+    former: str, name: str, told: str
+) -> None:
+    with pytest.warns(RenamedWarning, match=f"`{former}` is now `{name}`"):
+        spec = load_method_spec(former)
+    assert (spec.name, spec.told) == (name, told)

@@ -35,16 +35,21 @@ class LinearModes:
     amplitudes_m: NDArray[np.float64]
 
 
-def patch_responses(scene: Scene, model: FullOrderModel) -> NDArray[np.float64]:
-    """Return linear responses (3 n_patches, n_free), m, to 1 N along each axis on each patch.
+def patch_forces(scene: Scene) -> NDArray[np.float64]:
+    """Return forces of 1 N along each axis on each patch, on the free dofs, (3 n_patches, n_free).
 
-    Patches with smaller loads than others get less, in proportion.
+    All patches along x come first. Patches with smaller loads than others get less, in proportion.
     """
     on_nodes = scene.patch_weights.toarray() * scene.patch_scales[:, None]
     forces = np.zeros((3, *on_nodes.shape, 3))
     for axis in range(3):
         forces[axis, :, :, axis] = on_nodes
-    return model.rest_factor.solve(scene.at_free_dofs(forces.reshape(3 * len(on_nodes), -1)).T).T
+    return scene.at_free_dofs(forces.reshape(3 * len(on_nodes), -1))
+
+
+def patch_responses(scene: Scene, model: FullOrderModel) -> NDArray[np.float64]:
+    """Return linear responses (3 n_patches, n_free), m, to the forces of `patch_forces`."""
+    return model.rest_factor.solve(patch_forces(scene).T).T
 
 
 def linear_modes(scene: Scene, model: FullOrderModel, n_modes: int | None = None) -> LinearModes:

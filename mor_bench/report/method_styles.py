@@ -114,10 +114,11 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
         (("#8C6D31", "#E5B252"), ("#5E4716", "#F8E6C4"), ("#A5802F", "#A67C24")),
         (
             "sparse-polynomial",
-            "pgd",
+            "pgd-snapshots",
             "sparse-polynomial-derivative",
             "sparse-polynomial-force",
-            "pgd-force",
+            "pgd-snapshots-force",
+            "pgd-weak-form",
         ),
     ),
     "neural networks": (

@@ -18,7 +18,9 @@ FORMER_NAMES: dict[Kind, dict[str, tuple[str, str]]] = {
         "pca-regression-force": (
             "pca-regression",
             "PCA regression on the linear response is `pca-regression-linear`.",
-        )
+        ),
+        "pgd": ("pgd-snapshots", "PGD from the equations alone is `pgd-weak-form`."),
+        "pgd-force": ("pgd-snapshots-force", "PGD from the equations alone is `pgd-weak-form`."),
     },
 }
 """New names by former names, each with a note."""

@@ -40,6 +40,14 @@ def monomial_indices(n_variables: int, degree: int) -> Levels:
     return levels
 
 
+def by_degree(x: Array, levels: Levels) -> list[Array]:
+    """Return the monomials of the variables x (n, n_variables), by degree from 0."""
+    found = [np.ones((len(x), 1)), x]
+    for parents, variables in levels:
+        found.append(found[-1].take(parents, axis=1) * x.take(variables, axis=1))
+    return found
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _monomials(z, parents, variables, out):  # type: ignore[no-untyped-def]
     n_variables = z.shape[1]

@@ -1,4 +1,7 @@
-"""PGD: separated displacements over position, direction and magnitude of one load."""
+"""PGD fitted to snapshots: sums of functions of position, direction and magnitude of one load.
+
+`pgd_weak_form` finds such a sum from the equations, without snapshots.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.specs import DatasetSpec
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogates.monomials import monomial_indices
+from mor_bench.surrogates.monomials import Levels, by_degree, monomial_indices
 
 Array = NDArray[np.float64]
 
@@ -32,8 +35,6 @@ FLAT = 1e-6
 LEAST_WEIGHED = 0.02
 """Errors are divided by the load's magnitude, but at least by this fraction of the largest
 magnitude."""
-
-Levels = list[tuple[NDArray[np.int64], NDArray[np.int64]]]
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class LoadFunctions:
         d = vectors / np.where(length > 0, length, 1.0)[:, None]
         m = length / (self.largest or 1.0)
         of_position, of_direction = self._levels
-        by_position, by_direction = _by_degree(s, of_position), _by_degree(d, of_direction)
+        by_position, by_direction = by_degree(s, of_position), by_degree(d, of_direction)
         powers = m[:, None] ** np.arange(1, self.force_degree + 1)
         return np.concatenate(by_position[: self.position_degree + 1], axis=1), by_direction, powers
 
@@ -85,14 +86,6 @@ class LoadFunctions:
             monomial_indices(self.frame.shape[1], self.position_degree),
             monomial_indices(3, self.force_degree),
         )
-
-
-def _by_degree(x: Array, levels: Levels) -> list[Array]:
-    """Return the monomials of the variables x (n, n_variables), by degree from 0."""
-    found = [np.ones((len(x), 1)), x]
-    for parents, variables in levels:
-        found.append(found[-1].take(parents, axis=1) * x.take(variables, axis=1))
-    return found
 
 
 @dataclass(eq=False)

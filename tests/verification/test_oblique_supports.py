@@ -232,7 +232,8 @@ METHODS: dict[str, tuple[dict[str, Any], float]] = {
     "quadratic-manifold": ({"cubature_tolerance": 0.0}, 1e-3),
     "pca-regression-linear": ({}, 1e-7),
     "pca-regression": ({}, 1e-7),
-    "pgd": ({}, 1e-2),
+    "pgd-weak-form": ({"n_terms": 20}, 5e-2),
+    "pgd-snapshots": ({}, 1e-2),
     "hybrid": ({"start": "linear-fem", "start_parameters": {}, "tolerance": 1e-12}, 1e-10),
 }
 

@@ -109,7 +109,7 @@ def test_datasets_are_generated_and_learned(tmp_path: Path) -> None:
         method = load_method(name, **parameters).fit(data.scene, data.train)
         error = np.linalg.norm(method.predict(data.test.forces) - u) / np.linalg.norm(u)
         assert error < (1e-8 if name == "fem" else 0.2)
-    reason = load_method("pgd").supports(data.scene)
+    reason = load_method("pgd-snapshots").supports(data.scene)
     assert reason is not None
     assert "several act at once" in reason
     assert len(data.tests["2x"]) > 0
