@@ -237,7 +237,7 @@ class GraphUNet(MeshNetwork):
     def multiply_adds(self) -> int:
         ends = n_products(nn.ModuleList([self.field, self.encoder, self.decoder]))
         parts: Any = (m for m in self.modules() if isinstance(m, Exchange | Pool | Unpool))
-        return self.graph.n_nodes * ends + sum(part.multiply_adds for part in parts)
+        return self.graph.n_nodes * ends + sum(int(part.multiply_adds) for part in parts)
 
 
 @final
