@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -12,8 +12,13 @@ from torch import Tensor, nn
 from mor_bench.learning.training_plan import Loss, TrainingPlan
 from mor_bench.surrogates.field_surrogate import Arrays, FieldSurrogate
 
+SampleLoss = Literal["absolute", "relative"]
+
 SECOND_MOMENT_DECAY = 0.99
 """Adam's β₂. A value smaller than Adam's default suits short trainings."""
+
+SMALLEST_SIZE = 0.1
+"""Smallest denominator of relative errors, as a fraction of all samples' root mean square."""
 
 
 class FieldNetwork(nn.Module, ABC):
@@ -43,11 +48,13 @@ class FieldNetwork(nn.Module, ABC):
 class OperatorSurrogate(FieldSurrogate):
     """A `FieldSurrogate` with a `FieldNetwork`.
 
-    The training loss is the mean squared error over the components of all nodes. G(0) is subtracted
+    The training loss is the mean squared error over the components of all nodes. With the loss
+    "relative", the error of each sample is divided by the sample's mean square. G(0) is subtracted
     in training too.
     """
 
     network_: FieldNetwork
+    loss: SampleLoss = "absolute"
 
     @abstractmethod
     def build_network(self, constants: Arrays) -> FieldNetwork: ...
@@ -70,12 +77,15 @@ class OperatorSurrogate(FieldSurrogate):
         free = torch.ones(targets.shape[1:])
         free.view(-1)[torch.from_numpy(self.scene_.fixed_dofs)] = 0.0
         free = free.to(targets.device)
+        weights = relative_weights(targets) if self.loss == "relative" else None
 
         def loss(rows: Tensor) -> Tensor:
             at_rest = rows.new_full((1,), len(targets))
             answers = network(features[torch.cat([rows, at_rest])])
             errors: Tensor = (answers[:-1] - answers[-1:]) * free - targets[rows]
-            return errors.square().mean()
+            if weights is None:
+                return errors.square().mean()
+            return (errors.square().mean(dim=(1, 2)) * weights[rows]).mean()
 
         return loss
 
@@ -96,6 +106,17 @@ class OperatorSurrogate(FieldSurrogate):
 
     def n_products(self) -> int:
         return self.network_.multiply_adds
+
+
+def relative_weights(targets: Tensor) -> Tensor:
+    """Return weights ~ 1 / mean square of each target (n, n_nodes, 3), (n,), 1 on average.
+
+    The mean square is at least that of `SMALLEST_SIZE` times the root mean square of all.
+    """
+    size = targets.square().mean(dim=(1, 2))
+    least = max(SMALLEST_SIZE**2 * float(size.mean()), torch.finfo(size.dtype).tiny)
+    weights = 1.0 / size.clamp(min=least)
+    return weights / weights.mean()
 
 
 class SelfInitialised(ABC, nn.Module):
