@@ -205,7 +205,7 @@ def test_the_stated_work_is_that_of_all_products(layers: int) -> None:
 
 def test_a_width_that_the_heads_do_not_divide_is_refused(tiny: Dataset) -> None:
     method = mor_bench.load_method("transolver", **{**SMALL, "heads": 3})
-    with pytest.raises(InvalidInputError, match="`width` of Transolver must be a multiple.*got 8"):
+    with pytest.raises(InvalidInputError, match=r"`width` of Transolver must be a multiple.*got 8"):
         method.fit(tiny.scene, tiny.train[:8])
 
 
