@@ -31,6 +31,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "fno": {"channels": 4, "modes": 3, "layers": 2, "batch_size": 8},
     "mesh-graph-net": {"width": 8, "steps": 2, "batch_size": 8},
     "graph-u-net": {"width": 8, "levels": 2, "steps": 1, "batch_size": 8},
+    "transolver": {"width": 16, "heads": 2, "slices": 8, "layers": 1, "batch_size": 8},
 }
 
 
@@ -202,7 +203,7 @@ def test_a_file_whose_arrays_do_not_fit_its_hyperparameters_is_refused(
 ) -> None:
     method, path = make(name).fit(tiny.scene, tiny.train[:20]), tmp_path / "model.safetensors"
     other = copy.copy(method)
-    knob = "channels" if name == "fno" else "width"
+    knob = {"fno": "channels", "transolver": "slices"}.get(name, "width")
     setattr(other, knob, SMALL[name][knob] + 1)
     other.save(path)
     with pytest.raises(StoreError, match=r"`network.* must be|do not fit the network"):

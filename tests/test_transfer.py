@@ -31,6 +31,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "fno": {"channels": 2, "modes": 2, "layers": 1},
     "mesh-graph-net": {"width": 4, "steps": 1},
     "graph-u-net": {"width": 4, "levels": 2, "steps": 1},
+    "transolver": {"width": 4, "heads": 2, "slices": 2, "layers": 1, "mlp_ratio": 1},
     "pod-nn": {"n_hidden": 4, "n_input_modes": 8, "n_output_modes": 8, "input": "force"},
     "umesh-small": {"channels": 2, "steps": 1, "validation_fraction": 0.0},
 }
@@ -75,7 +76,9 @@ def test_a_model_of_another_class_is_refused(files: dict[str, Path], tiny: Datas
         started(make("fno"), files["mesh-graph-net"], tiny.train[:12])
 
 
-@pytest.mark.parametrize("name", ["fno", "mesh-graph-net", "graph-u-net", "umesh-small"])
+@pytest.mark.parametrize(
+    "name", ["fno", "mesh-graph-net", "graph-u-net", "transolver", "umesh-small"]
+)
 def test_a_training_on_the_same_scene_starts_from_the_same_weights(
     name: str, files: dict[str, Path], tiny: Dataset
 ) -> None:
@@ -107,6 +110,12 @@ def test_every_trained_method_names_its_architecture() -> None:
         ("graph-u-net", "levels", 1),
         ("graph-u-net", "steps", 2),
         ("graph-u-net", "input", "linear-response"),
+        ("transolver", "width", 8),
+        ("transolver", "heads", 1),
+        ("transolver", "slices", 3),
+        ("transolver", "layers", 2),
+        ("transolver", "mlp_ratio", 2),
+        ("transolver", "input", "linear-response"),
         ("fno", "channels", 4),
         ("fno", "modes", 3),
         ("fno", "layers", 2),
@@ -165,9 +174,9 @@ def test_another_mesh_takes_only_weights_that_keep_their_meaning(
     scene = replace(tiny.scene, mesh=mesh, fixed_nodes=np.flatnonzero(mesh.points[:, 0] == 0))
     displacements = np.random.default_rng(0).normal(size=(8, len(scene.free_dofs)))
     samples = Snapshots(scene, draw_loads(scene, 0, 8), displacements, np.ones(8))
-    if name in ("mesh-graph-net", "graph-u-net", "umesh-small", "fno"):
+    if name in ("mesh-graph-net", "graph-u-net", "transolver", "umesh-small", "fno"):
         started(make(name), files[name], samples)
-    if name in ("mesh-graph-net", "graph-u-net", "umesh-small"):
+    if name in ("mesh-graph-net", "graph-u-net", "transolver", "umesh-small"):
         return
     knobs, path = {}, files[name]
     if name == "fno":  # for a grid with more wave numbers
@@ -184,6 +193,7 @@ ARRAYS = {
     "fno": ["network.lift.weight"],
     "mesh-graph-net": ["network.decoder.0.weight"],
     "graph-u-net": ["network.decoder.0.weight"],
+    "transolver": ["network.blocks.0.attention.assign.weight"],
     "umesh-small": ["network.head.weight"],
     "deeponet": ["network.branch.2.weight", "constant.axes"],
     "pod-deeponet": ["network.branch.2.weight", "constant.modes"],

@@ -135,7 +135,7 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
     ),
     "neural operators and graphs": (
         (("#2A93CC", "#7CC4EE"), ("#1B6A96", "#CBE9FA"), ("#3C8FB8", "#3D88B4")),
-        ("deeponet", "fno", "mesh-graph-net", "pod-deeponet", "graph-u-net"),
+        ("deeponet", "fno", "mesh-graph-net", "pod-deeponet", "graph-u-net", "transolver"),
     ),
 }
 """Shades and members of each family."""

@@ -13,13 +13,13 @@ from torch import Tensor
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import change_of_basis, input_axes
-from mor_bench.scene.mesh import Mesh
 from mor_bench.surrogates.field_network import (
     FieldNetwork,
     OperatorSurrogate,
     add_constants,
     n_products,
     perceptron,
+    scaled_positions,
 )
 from mor_bench.surrogates.field_surrogate import Array, Arrays, Input
 
@@ -161,12 +161,6 @@ class DeepONet(OperatorSurrogate):
             for name in (f"{last}.weight", f"{last}.bias")
         }
         return weights | {name: value.float() for name, value in turned.items()}
-
-
-def scaled_positions(mesh: Mesh) -> Tensor:
-    """Return node positions from the middle of the bounding box, in halves of its longest edge."""
-    low, high = mesh.bounds
-    return _single(2.0 * (mesh.points - (low + high) / 2) / (high - low).max())
 
 
 def _single(array: Array) -> Tensor:

@@ -6,10 +6,12 @@ from abc import ABC, abstractmethod
 from itertools import pairwise
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from mor_bench.learning.training_plan import Loss, TrainingPlan
+from mor_bench.scene.mesh import Mesh
 from mor_bench.surrogates.field_surrogate import Arrays, FieldSurrogate
 
 SampleLoss = Literal["absolute", "relative"]
@@ -160,3 +162,10 @@ def add_constants(module: nn.Module, **arrays: Any) -> None:
     """Add buffers that `state_dict` leaves out."""
     for name, array in arrays.items():
         module.register_buffer(name, array, persistent=False)
+
+
+def scaled_positions(mesh: Mesh) -> Tensor:
+    """Return node positions from the middle of the bounding box, in halves of its longest edge."""
+    low, high = mesh.bounds
+    scaled = 2.0 * (mesh.points - (low + high) / 2) / (high - low).max()
+    return torch.from_numpy(scaled.astype(np.float32))

@@ -127,6 +127,10 @@ class FieldSurrogate(Surrogate, ABC):
         """Return the root mean square over samples, nodes and components; 1 if all are zero."""
         return float(np.sqrt(np.mean(np.square(values)))) or 1.0
 
+    def input_scale(self, values: Array) -> float:
+        """Return the divisor of the input, by default its `scale`."""
+        return self.scale(values)
+
     def turned(self, weights: dict[str, Tensor], source: Arrays, target: Arrays) -> Any:
         """Convert the weights of a model with other constants and scales; return them."""
         return weights
@@ -148,7 +152,7 @@ class FieldSurrogate(Surrogate, ABC):
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         self.set_up(scene)
         given, wanted = self._pairs(samples)
-        scales = np.array([self.scale(given), self.scale(wanted)])
+        scales = np.array([self.input_scale(given), self.scale(wanted)])
         inputs, targets = given / scales[0], wanted / scales[1]
         constants = self.constants(inputs, targets)
         model: dict[str, NDArray[Any]] = {f"constant.{k}": v for k, v in constants.items()}
