@@ -124,7 +124,8 @@ def test_slice_weights_sum_to_one_and_sharpen_at_low_temperature() -> None:
 def test_a_block_adds_to_its_input_what_depends_on_the_normalised_input() -> None:
     block, nodes = Block(WIDTH, HEADS, SLICES, 2), 10 * drawn(2, 7, WIDTH)
     initialise(block, torch.Generator().manual_seed(0))
-    attended, changed = block.attention.mix.weight, block.perceptron[-1].weight
+    last: Any = block.perceptron[-1]
+    attended, changed = block.attention.mix.weight, last.weight
     with torch.no_grad():
         whole = block(nodes)
         for silent, other in ((attended, changed), (changed, attended)):
