@@ -258,8 +258,8 @@ class MultiScaleGraphNet(OperatorSurrogate):
     steps : int
         Steps of message passing per graph, on the way down and on the way up.
     loss : {"absolute", "relative", "auto"}
-        Mean squared error, without or with division by each sample's mean square. "auto" divides for
-        the linear response only.
+        Mean squared error, without or with division by each sample's mean square. "auto" divides
+        for the linear response only.
     """
 
     input: Input = "force"

@@ -116,8 +116,8 @@ class MeshGraphNet(OperatorSurrogate):
     hidden_layers : int
         Hidden layers of each perceptron. The paper uses 2.
     loss : {"absolute", "relative", "auto"}
-        Mean squared error, without or with division by each sample's mean square. "auto" divides for
-        the linear response only.
+        Mean squared error, without or with division by each sample's mean square. "auto" divides
+        for the linear response only.
     """
 
     input: Input = "force"
