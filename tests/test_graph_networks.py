@@ -326,3 +326,16 @@ def test_answers_are_the_same_alone_in_a_batch_and_from_a_file(
     method.save(tmp_path / "model.safetensors")
     loaded = mor_bench.load_surrogate(tmp_path / "model.safetensors")
     np.testing.assert_array_equal(loaded.predict(forces), answers)
+
+
+@pytest.mark.parametrize(
+    ("input", "expected"), [("force", "absolute"), ("linear-response", "relative")]
+)
+def test_the_automatic_loss_follows_the_input(input: str, expected: str, tiny: Dataset) -> None:
+    curves = {}
+    for loss in ("auto", "absolute", "relative"):
+        knobs: dict[str, Any] = {"loss": loss, "input": input, "width": 4, "iterations": 2}
+        method: Any = mor_bench.load_method("graph-u-net", **knobs)
+        curves[loss] = method.fit(tiny.scene, tiny.train[:20]).loss_curve_[0]
+    assert curves["auto"] == curves[expected]
+    assert curves["absolute"] != curves["relative"]

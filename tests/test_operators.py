@@ -30,7 +30,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "pod-deeponet": {"width": 16, "depth": 2, "n_functions": 8, "n_input_modes": 20},
     "fno": {"channels": 4, "modes": 3, "layers": 2, "batch_size": 8},
     "mesh-graph-net": {"width": 8, "steps": 2, "batch_size": 8},
-    "graph-u-net": {"width": 8, "levels": 2, "steps": 1, "batch_size": 8},
+    "graph-u-net": {"width": 8, "levels": 2, "steps": 1, "batch_size": 8, "loss": "absolute"},
     "transolver": {"width": 16, "heads": 2, "slices": 8, "layers": 1, "batch_size": 8},
 }
 

@@ -14,7 +14,7 @@ from mor_bench.learning.training_plan import Loss, TrainingPlan
 from mor_bench.scene.mesh import Mesh
 from mor_bench.surrogates.field_surrogate import Arrays, FieldSurrogate
 
-SampleLoss = Literal["absolute", "relative"]
+SampleLoss = Literal["absolute", "relative", "auto"]
 
 SECOND_MOMENT_DECAY = 0.99
 """Adam's β₂. A value smaller than Adam's default suits short trainings."""
@@ -51,8 +51,9 @@ class OperatorSurrogate(FieldSurrogate):
     """A `FieldSurrogate` with a `FieldNetwork`.
 
     The training loss is the mean squared error over the components of all nodes. With the loss
-    "relative", the error of each sample is divided by the sample's mean square. G(0) is subtracted
-    in training too.
+    "relative", the error of each sample is divided by the sample's mean square. The loss "auto" is
+    "relative" for the linear response and "absolute" for the force. G(0) is subtracted in training
+    too.
     """
 
     network_: FieldNetwork
@@ -79,7 +80,10 @@ class OperatorSurrogate(FieldSurrogate):
         free = torch.ones(targets.shape[1:])
         free.view(-1)[torch.from_numpy(self.scene_.fixed_dofs)] = 0.0
         free = free.to(targets.device)
-        weights = relative_weights(targets) if self.loss == "relative" else None
+        relative = self.loss == "relative" or (
+            self.loss == "auto" and self.input == "linear-response"
+        )
+        weights = relative_weights(targets) if relative else None
 
         def loss(rows: Tensor) -> Tensor:
             at_rest = rows.new_full((1,), len(targets))

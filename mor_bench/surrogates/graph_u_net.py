@@ -257,8 +257,9 @@ class MultiScaleGraphNet(OperatorSurrogate):
         Number of coarser graphs.
     steps : int
         Steps of message passing per graph, on the way down and on the way up.
-    loss : {"absolute", "relative"}
-        Mean squared error, without or with division by each sample's mean square.
+    loss : {"absolute", "relative", "auto"}
+        Mean squared error, without or with division by each sample's mean square. "auto" divides
+        for the linear response only.
     """
 
     input: Input = "force"

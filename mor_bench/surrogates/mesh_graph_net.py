@@ -115,8 +115,9 @@ class MeshGraphNet(OperatorSurrogate):
         Message-passing steps, each with its own weights. The paper uses 15.
     hidden_layers : int
         Hidden layers of each perceptron. The paper uses 2.
-    loss : {"absolute", "relative"}
-        Mean squared error, without or with division by each sample's mean square.
+    loss : {"absolute", "relative", "auto"}
+        Mean squared error, without or with division by each sample's mean square. "auto" divides
+        for the linear response only.
     """
 
     input: Input = "force"
