@@ -251,7 +251,7 @@ def test_the_interval_of_a_seed_is_a_t_interval_on_the_logarithm() -> None:
     "setting", [Setting(3, 13, 0.05, samples=100), Setting(10, 40, 0.3, samples=100)]
 )
 def test_the_interval_of_a_trained_method_covers_another_training(setting: Setting) -> None:
-    assert coverage(setting, 100, 200, np.random.default_rng(0)) >= 0.93
+    assert min(coverage(setting, 100, 200, np.random.default_rng(0))) >= 0.93
 
 
 def test_draws_of_errors_hold_trainings_and_regions() -> None:

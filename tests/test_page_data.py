@@ -185,7 +185,7 @@ def test_each_worst_says_which_one_it_is(comparison: Comparison, page: str) -> N
     row = comparison.row("beam-tiny", data["winner"])
     arrays = comparison.samples(row)
     error = arrays["worst_prediction"] - arrays["worst_reference"]
-    drawn = np.linalg.norm(error) / np.linalg.norm(arrays["worst_reference"])
+    drawn = float(np.linalg.norm(error) / np.linalg.norm(arrays["worst_reference"]))
     nodal = 1e3 * np.linalg.norm(error, axis=1).max()
     assert row.error is not None
     largest = percent(row.error.rel_l2_max)

@@ -100,7 +100,8 @@ def test_the_verdict_of_a_run_is_that_of_its_rows(run: str) -> None:
 
 
 def _command(run: str) -> dict[str, str]:
-    return tomllib.loads((REPORTS / run / "run.toml").read_text(encoding="utf-8"))["run"]
+    record: dict[str, str] = tomllib.loads((REPORTS / run / "run.toml").read_text("utf-8"))["run"]
+    return record
 
 
 def _needs_history() -> None:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from safetensors.numpy import load_file, save_file
 
 import mor_bench
@@ -21,7 +20,7 @@ from mor_bench.runs.cached_fit import RunEnvironment
 from mor_bench.runs.code_digest import bare_code, learning_digest
 from mor_bench.runs.configurations import configurations_of
 from mor_bench.runs.plan import plan
-from mor_bench.runs.shipped_models import Binding, SampleSketch, ShippedModel, shipped_models
+from mor_bench.runs.shipped_models import Binding, SampleSketch, shipped_models
 from mor_bench.runs.training_data import TrainingData
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
 from mor_bench.specs import DatasetSpec, load_dataset_spec, load_method_spec
@@ -43,15 +42,6 @@ def test_shipped_weights_agree_with_the_code_the_parameters_and_the_split() -> N
         assert weights.stat().st_size < 1.5e6
 
 
-def test_a_record_names_the_code_that_trained_its_weights() -> None:
-    for model in shipped_models().values():
-        content = model.model_dump()
-        assert model.trained_with_code == model.binding.code or model.same_training
-        content |= {"trained_with_code": "0" * 64, "same_training": None}
-        with pytest.raises(ValidationError, match="same_training"):
-            ShippedModel.model_validate(content)
-
-
 @pytest.mark.slow
 def test_the_code_of_the_named_commit_trained_the_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -68,7 +58,7 @@ def test_the_code_of_the_named_commit_trained_the_weights(
         with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
             archive.extractall(tree, filter="data")
         monkeypatch.setattr("mor_bench.runs.code_digest.SOURCES", tree)
-        assert learning_digest(model.binding.surrogate) == model.trained_with_code
+        assert learning_digest(model.binding.surrogate) == model.binding.code
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict
 
 from mor_bench.checked_files import read_bytes, read_json
 from mor_bench.digests import digest_of_arrays, digest_of_file
@@ -51,7 +51,8 @@ class Binding(BaseModel):
     split : dict
         The split's settings.
     code : str
-        See `mor_bench.runs.code_digest.learning_digest`.
+        Digest of the code that trained the weights, see
+        `mor_bench.runs.code_digest.learning_digest`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -128,10 +129,6 @@ class ShippedModel(BaseModel):
     train, validation : SampleSketch
     fit : FitRecord
         Cost and results of the training, with its origin and the weights' checksum.
-    trained_with_code : str
-        Digest of the code that trained the weights, as in `Binding`.
-    same_training : str, optional
-        Check by which the code of the binding is held to train the same weights, if it differs.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
@@ -140,28 +137,12 @@ class ShippedModel(BaseModel):
     train: SampleSketch
     validation: SampleSketch
     fit: FitRecord
-    trained_with_code: str
-    same_training: str | None = None
-
-    @model_validator(mode="after")
-    def _explain_other_code(self) -> ShippedModel:
-        if self.trained_with_code != self.binding.code and not self.same_training:
-            raise ValueError(
-                "other code trained the weights; `same_training` must say why they hold"
-            )
-        return self
 
     @classmethod
     def of(cls, binding: Binding, data: TrainingData, fit: FitRecord) -> ShippedModel:
         """Describe weights that were trained on these samples."""
         train, validation = SampleSketch.of(data.train), SampleSketch.of(data.validation)
-        return cls(
-            binding=binding,
-            train=train,
-            validation=validation,
-            fit=fit,
-            trained_with_code=binding.code,
-        )
+        return cls(binding=binding, train=train, validation=validation, fit=fit)
 
     def agrees_with(self, data: TrainingData) -> bool:
         """Return whether the weights were trained on these samples."""

@@ -188,10 +188,10 @@ def best_of_class(source: str, dataset: str = "") -> str:
         by_class.setdefault(class_text(row, is_observed(run, name)), []).append(row)
     body = []
     for told, rows in by_class.items():
-        row = sufficient(rows, bounds, need)
+        best = sufficient(rows, bounds, need)
         cells = (
-            [f"`{row.method}`", _configuration(row), _error(run, row), _latency(run, row)]
-            if row
+            [f"`{best.method}`", _configuration(best), _error(run, best), _latency(run, best)]
+            if best
             else ["none meets the need", *[DASH] * 3]
         )
         body.append([told, *cells])
