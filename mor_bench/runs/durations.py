@@ -17,6 +17,7 @@ from mor_bench.measure.latency import (
     BATCH_S,
     MOST_BATCH_S,
     MOST_TURN_S,
+    OPEN_S,
     PROTOCOLS,
     SERVER_S,
     TURN_S,
@@ -43,7 +44,7 @@ START_S, TORCH_S, REPORT_S = 0.3, 2.0, 11.0
 """Times on the reference machine: to start a process, to import PyTorch, and to write tables,
 figures and report, s."""
 
-KERNELS_S, METHOD_S = 12.0, 1.0
+KERNELS_S, METHOD_S = 6.0, 1.0
 """Times to compile the full-order model, and a method that states no `compile_s`, s."""
 
 PROBED = 8
@@ -174,8 +175,7 @@ def timing_seconds(
     turn = min(MOST_TURN_S, max(TURN_S, (protocol.queries + SETTLE_QUERIES) * query_s))
     batches = [max(BATCH_S, n * query_s) for n in BATCHES if n * query_s <= MOST_BATCH_S]
     turns = protocol.processes * (protocol.rounds + 1) * turn + sum(batches)
-    starts = [START_S + (TORCH_S if needs_torch(item) else 0.0) for item in configurations]
-    opened = protocol.processes * (SERVER_S + sum(starts) / cores)
+    opened = protocol.processes * (SERVER_S + OPEN_S * len(configurations) / cores)
     return len(configurations) * turns + pace.interpreter * opened
 
 
