@@ -21,7 +21,7 @@ class MorBenchError(Exception):
     ...     mor_bench.load_scene("no-such-scene")
     ... except MorBenchError as error:
     ...     type(error).__name__
-    'SpecError'
+    'UnknownNameError'
     """
 
 

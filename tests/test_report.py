@@ -217,7 +217,7 @@ def test_the_discretisation_error_is_shown_with_its_evidence() -> None:
     rows = [a_row("pod"), a_row("pod", discretisation_error_m=0.0123)]
     rows.append(rows[1].with_parts(discretisation_rel_l2=0.205))
     unknown, alone, both = (discretisation_error([Entry(row)]) for row in rows)
-    assert unknown == "not measured"
+    assert unknown == "not known"
     assert alone.startswith("1.2e-02 m; an error")
     assert both.startswith("1.2e-02 m, relative L2 error 20.5 % (median); an error")
 

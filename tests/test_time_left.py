@@ -23,10 +23,6 @@ FITS: dict[str, list[float | None]] = {
 }
 
 
-LATE = ("fit", "timing", "report")
-"""Stages that are left where kernels and samples are in the cache."""
-
-
 def planned() -> Plan:
     """A plan of 40 s of samples, 80 s of fits and 100 s of timing."""
     steps = [Step("beam", "samples", False, 40.0, "samples")]
@@ -73,7 +69,6 @@ def test_after_a_minute_the_time_left_is_right_within_a_third_if_the_plan_is_fai
     left = TimeLeft.of(planned())
     common = generator.uniform(0.8, 1.25)
     pace = {task.stage: common * generator.uniform(0.85, 1.15) for task in left.steps}
-    pace["timing"] /= common  # its turns end after a fixed time
     passed = list(events(left, pace))
     end, checked = passed[-1][0], 0
     for now, task, fraction in passed[:-1]:
@@ -82,37 +77,6 @@ def test_after_a_minute_the_time_left_is_right_within_a_third_if_the_plan_is_fai
             checked += 1
             assert left.seconds(now) == pytest.approx(end - now, rel=0.3, abs=3.0), (now, task)
     assert checked > 20
-
-
-@pytest.mark.parametrize("cached", [False, True])
-@pytest.mark.parametrize("load", [1.5, 2.0, 2.5])
-def test_after_a_minute_the_time_left_is_right_on_a_machine_under_load(
-    load: float, cached: bool
-) -> None:
-    left = TimeLeft.of(planned())
-    if cached:  # then only fits tell how slow the machine is
-        left.steps = {task: s for task, s in left.steps.items() if task.stage in LATE}
-    generator = np.random.default_rng(0)
-    pace = {task.stage: load * generator.uniform(0.9, 1.1) for task in left.steps}
-    pace["timing"] /= load  # its turns end after a fixed time
-    passed = list(events(left, pace))
-    end, checked = passed[-1][0], 0
-    for now, task, fraction in passed[:-1]:
-        left.enter(task, now, fraction)
-        if now > 60:
-            checked += 1
-            assert left.seconds(now) == pytest.approx(end - now, rel=0.3, abs=3.0), (now, task)
-    assert checked > 15
-
-
-def test_fits_that_take_some_seconds_more_are_not_taken_for_a_slow_machine() -> None:
-    left = TimeLeft.of(planned())
-    left.enter(Task("beam", "fit", "fem"), 0.0)
-    left.enter(Task("beam", "fit", "pod"), 1.5 + 2 * 2.0)
-    left.enter(Task("beam", "fit", "umesh"), 5.5 + 11.0 + 4 * 2.0)
-    steps = [left.steps[Task("beam", "fit", name)] for name in ("umesh", "mine")]
-    planned_s, n_steps = sum(map(sum, steps)), sum(map(len, steps))
-    assert left.seconds(24.5) == pytest.approx(planned_s + 2 * n_steps + 105, rel=0.15)
 
 
 def test_a_known_share_of_a_task_corrects_a_plan_that_is_far_off() -> None:
@@ -127,7 +91,7 @@ def test_a_task_that_takes_longer_than_planned_keeps_a_rest() -> None:
     left = TimeLeft.of(planned())
     left.enter(Task("beam", "fit", "fem"), 0.0)
     rest = left.seconds(0.0) - 1.5
-    assert left.seconds(100.0) > rest + 10.0  # and all else is expected to be slower, too
+    assert left.seconds(100.0) == pytest.approx(rest + 10.0)
 
 
 def test_what_is_not_planned_is_ignored_and_a_share_of_fits_counts() -> None:
@@ -154,7 +118,7 @@ def test_progress_in_a_pipe_is_lines_with_the_time_left(
         listener.timing("beam", 40, 50)
     shown = capsys.readouterr().out
     assert "beam: 50 of 100 samples; " in shown
-    assert re.search(r"beam: fit 2 of 6, pod \[n=0\]; [\d.]+ (s|min) left\n", shown)
+    assert re.search(r"beam: fit 2 of 6, pod \[n=0\]; \d+ (s|min) left\n", shown)
     assert "umesh: failed: no [b]memory[/b]" in shown
     assert "beam: timing in turns, 80 %" in shown
     assert "pod: error" not in shown

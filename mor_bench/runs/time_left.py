@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -21,10 +21,10 @@ ORDER: tuple[tuple[StageName, ...], ...] = (
 UNKNOWN_S = 5.0
 """Assumed duration of a fit that nothing is known about, s."""
 
-PRIOR_S = 5.0
+PRIOR_S = 15.0
 """Planned seconds of finished tasks whose measured pace counts as much as the prior one."""
 
-MOST_CORRECTION = 8.0
+MOST_CORRECTION = 5.0
 """Largest factor by which the pace of a stage corrects the plan."""
 
 MEASURED: tuple[StageName, ...] = ("timing",)
@@ -32,13 +32,6 @@ MEASURED: tuple[StageName, ...] = ("timing",)
 
 FITTED: tuple[StageName, ...] = ("fit", "other seeds", "learning curve")
 """Stages of fits."""
-
-PACE_SPREAD, EXCESS_S = 1.0, 2.0
-"""Standard deviations of the factor by which fits are slower than planned, and of the seconds that
-each step takes beyond that, before any fit is measured."""
-
-NOISE, NOISE_S = 0.15, 0.3
-"""Deviation of a fit from the law of its stage: a share of its duration, and s."""
 
 OVERTIME = 0.1
 """Share of its duration so far that a task which takes longer than planned is expected to take."""
@@ -50,10 +43,6 @@ class Task(NamedTuple):
     dataset: str
     stage: StageName
     method: str = ""
-
-
-Known = Mapping[Task, float]
-"""Measured seconds of tasks."""
 
 
 def tasks_of(plan: Plan) -> Iterator[tuple[Task, list[float]]]:
@@ -99,8 +88,8 @@ class TimeLeft:
 
     def share(self, task: Task, n: int) -> float:
         """Return the planned share of the first steps of a task."""
-        factor, more = self._law(task.stage, self.spent, self._common(self.spent))
-        steps = [factor * seconds + more for seconds in self.steps.get(task, [])]
+        more = self._excess(task.stage)
+        steps = [seconds + more for seconds in self.steps.get(task, [])]
         return sum(steps[:n]) / sum(steps) if sum(steps) else 0.0
 
     def enter(self, task: Task, now: float, fraction: float = 0.0) -> None:
@@ -115,77 +104,45 @@ class TimeLeft:
 
     def seconds(self, now: float) -> float:
         """Estimate the seconds from now to the end of the run."""
-        order, known = list(self.steps), self._known(now)
+        order = list(self.steps)
         first = 0 if self._current is None else order.index(self._current) + 1
-        ahead = sum(self._expected(task, known) for task in order[first:])
-        return ahead + self._left_in_current(now, known)
+        ahead = sum(map(self._expected, order[first:]))
+        return ahead + self._left_in_current(now)
 
-    def _known(self, now: float) -> Known:
-        """Return what is measured; a task under way counts once it takes longer than expected."""
-        task, elapsed = self._current, now - self._since
-        if task is None or elapsed <= self._expected(task, self.spent):
-            return self.spent
-        if self._seen[0] > 0 and task.stage not in FITTED:  # its share says more
-            return self.spent
-        return {**self.spent, task: elapsed}
+    def _expected(self, task: Task) -> float:
+        """Return the expected seconds of a task that is not finished.
 
-    def _expected(self, task: Task, known: Known) -> float:
-        """Return the expected seconds of a task, from those that are measured.
-
-        On a machine under load all is slower by a factor. Beside it, each fit takes some seconds
-        more than planned, for processes and scores, however long it trains.
+        Fits that exceed their plan do so by about the same time each, for processes and scores,
+        however long they train. All else is slower or faster by a factor.
         """
-        planned = sum(self.steps[task])
-        if task.stage not in FITTED:
-            return planned * self._pace(task.stage, known)
-        factor, more = self._law(task.stage, known, self._common(known))
-        return factor * planned + len(self.steps[task]) * more
+        planned, more = sum(self.steps[task]), self._excess(task.stage)
+        if more > 0:
+            return planned + len(self.steps[task]) * more
+        return planned * self._pace(task.stage)
 
-    def _law(self, stage: StageName, known: Known, prior: float) -> tuple[float, float]:
-        """Return how the fits of a stage depend on the plan: a factor, and seconds per step.
+    def _excess(self, stage: StageName) -> float:
+        """Return by how much a step of a stage of fits exceeds its plan, s; 0 if it does not."""
+        done = [task for task in self.spent if task.stage == stage and self.steps[task]]
+        if stage not in FITTED or not done:
+            return 0.0
+        more = sum(self.spent[task] - sum(self.steps[task]) for task in done)
+        return max(0.0, more / sum(len(self.steps[task]) for task in done))
 
-        They are fitted to the measured tasks by weighted least squares. `prior` is the factor
-        before any is measured.
-        """
-        # Normal equations of both numbers; each prior is like a measurement.
-        aa, ab, bb = PACE_SPREAD**-2, 0.0, EXCESS_S**-2
-        ya, yb = prior * aa, 0.0
-        for task in [task for task in known if task.stage == stage]:
-            planned, n, spent = sum(self.steps[task]), len(self.steps[task]), known[task]
-            weight = (NOISE * spent + NOISE_S) ** -2
-            aa, ab, bb = aa + weight * planned**2, ab + weight * planned * n, bb + weight * n**2
-            ya, yb = ya + weight * planned * spent, yb + weight * n * spent
-        factor = (bb * ya - ab * yb) / (aa * bb - ab**2)
-        if yb < ab * factor:  # then no step takes longer than planned by the factor
-            factor = ya / aa
-        factor = min(max(factor, 1 / MOST_CORRECTION), MOST_CORRECTION)
-        return factor, max(0.0, (yb - ab * factor) / bb)
-
-    def _common(self, known: Known, prior: float = 1.0) -> float:
-        """Return measured over planned seconds of all stages but fits and timing."""
-        apart = (*FITTED, *MEASURED)
-        return self._ratio([task for task in known if task.stage not in apart], known, prior)
-
-    def _pace(self, stage: StageName, known: Known) -> float:
-        """Return measured over planned seconds of a stage, or of all before it, fits included.
-
-        A slow machine does not lengthen turns of timing: they end after a fixed time.
-        """
-        common = self._common(known, self._law("fit", known, 1.0)[0])
-        prior = 1.0 if stage in MEASURED else common
-        pace = self._ratio([task for task in known if task.stage == stage], known, prior)
+    def _pace(self, stage: StageName) -> float:
+        """Return measured over planned seconds of the stage, or of all but fits at first."""
+        common = self._ratio([task for task in self.spent if task.stage not in FITTED], 1.0)
+        pace = self._ratio([task for task in self.spent if task.stage == stage], common)
         return min(max(pace, 1 / MOST_CORRECTION), MOST_CORRECTION)
 
-    def _ratio(self, done: Sequence[Task], known: Known, prior: float) -> float:
-        done = [task for task in done if sum(self.steps[task]) > 0]
+    def _ratio(self, done: Sequence[Task], prior: float) -> float:
         planned = sum(sum(self.steps[task]) for task in done)
-        spent = sum(known[task] for task in done)
+        spent = sum(self.spent[task] for task in done)
         return (spent + PRIOR_S * prior) / (planned + PRIOR_S)
 
-    def _left_in_current(self, now: float, known: Known) -> float:
+    def _left_in_current(self, now: float) -> float:
         if self._current is None:
             return 0.0
-        total = self._expected(self._current, known)
+        total = self._expected(self._current)
         fraction, at_s = self._seen
         if fraction > 0:
             trust = 1.0 if self._current.stage in MEASURED else min(1.0, 2 * fraction)

@@ -99,7 +99,10 @@ def _write(group: h5py.Group, arrays: Mapping[str, NDArray[Any]]) -> None:
 def _intervals(record: Mapping[str, Any]) -> dict[str, Interval]:
     """Return the intervals of a row of comparison.json."""
     found = {k: v for k, v in record.items() if isinstance(v, dict)}
-    return {k: (v["low"], inf if v["high"] is None else v["high"]) for k, v in found.items()}
+    return {
+        k: (inf if v["low"] is None else v["low"], inf if v["high"] is None else v["high"])
+        for k, v in found.items()
+    }
 
 
 def verdict_again(comparison: Comparison, analysis: Mapping[str, Any], name: str) -> Verdict:
