@@ -14,8 +14,7 @@ from mor_bench.analysis.analyse import analyse
 from mor_bench.report.aligned_lines import Line, aligned_lines
 from mor_bench.report.console_tables import Detail, print_plan, print_tables
 from mor_bench.report.number_format import milliseconds_text, seconds_text
-from mor_bench.report.short_names import short_names
-from mor_bench.report.verdict_words import in_words
+from mor_bench.report.short_names import renamed, short_names
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import TrainedElsewhere
 from mor_bench.runs.plan import Plan, Step
@@ -101,7 +100,7 @@ def test_six_columns_fit_the_width_and_no_name_is_broken(
 def test_the_verdict_comes_first_and_is_alone_if_quiet(
     shown: Any, made: Comparison, analysis: dict[str, Any]
 ) -> None:
-    headline = in_words(analysis["verdicts"][0]["headline"], short_names(made.rows))
+    headline = renamed(analysis["verdicts"][0]["headline"], short_names(made.rows))
     assert " · " in headline
     needs, finding = headline.split(". ", 1)
     assert shown(10_000).splitlines()[1:3] == [finding, f"- {needs}."]

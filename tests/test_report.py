@@ -21,10 +21,9 @@ from mor_bench.report.entries import Entry, best_per_method, entries_of
 from mor_bench.report.figures import pictures_of
 from mor_bench.report.number_format import bytes_text, number, percent, short_swept
 from mor_bench.report.page import render
-from mor_bench.report.short_names import short_names
+from mor_bench.report.short_names import renamed, short_names
 from mor_bench.report.speed_tables import NOT_REACHED, pairs_at, target_table
 from mor_bench.report.summary import discretisation_error, warnings_of
-from mor_bench.report.verdict_words import in_words
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import ErrorSummary
 from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
@@ -111,7 +110,7 @@ def test_console_and_page_show_every_row_with_its_reason(comparison: Comparison,
             *summary["headline"].split(". ", 1),
         ):
             flat = " ".join(text.split())
-            assert said in flat or in_words(said, names) in flat
+            assert said in flat or renamed(said, names) in flat
 
 
 def test_a_legacy_code_page_does_not_stop_the_run(comparison: Comparison) -> None:

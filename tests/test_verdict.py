@@ -269,10 +269,11 @@ def test_without_a_choice_the_text_names_the_limits_to_relax() -> None:
     chosen = choose([slow, rough, a_row("broken", n_failed=2)], limits, "d")
     assert chosen.nearest == rough
     for line in (
-        "d needs error <= 1 % (relative l2, median), latency <= 3 ms (median), memory <= 1000 MB.",
+        "d needs error <= 1 % (relative L2 error, median), latency <= 3 ms (median), "
+        "memory <= 1000 MB.",
         "No configuration qualifies among 3 configurations.",
         "1 of 3 configurations failed, were skipped or left loads without an answer.",
-        "Enough alone: error <= 2 % (relative l2, median), by rough",
+        "Enough alone: error <= 2 % (relative L2 error, median), by rough",
         "Enough alone: latency <= 12.4 ms (median), by exact",
         "Not enough alone: memory, whatever the limit",
         "The nearest is rough, 1 ms at 2 %, with error 2 times the limit.",

@@ -50,8 +50,8 @@ def write_parts(out: str | Path, body: Body, parts: Mapping[str, Samples]) -> li
     """Write parts to an NPZ file and a TOML that reads them again; return both.
 
     With a part ``test``, the split is that of the parts. Otherwise test samples are drawn by load
-    region if regions are known, else at random. Validation samples without a part ``validation``
-    are drawn alike.
+    region if regions are known, and validation samples too; else both are drawn at random. So are
+    validation samples if there is a part ``test`` but none ``validation``.
 
     Raises
     ------

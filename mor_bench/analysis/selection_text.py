@@ -23,8 +23,18 @@ FIGURE_NAMES = {
 }
 """Names of the figures that requirements limit."""
 
+ERROR = "relative L2 error"
+"""The one name of this error in sentences, on the page and in pictures."""
+
+RUNNER_UP = "runner-up (another method)"
+"""What the second is: the fastest, or by offline cost the cheapest, of those that qualify. A
+configuration of the winner's own method is none."""
+
+NO_RUNNER_UP = "No other method qualifies."
+"""What is said where there is no runner-up."""
+
 _UNITS = {
-    "error": (100.0, " % (relative l2, median)"),
+    "error": (100.0, f" % ({ERROR}, median)"),
     "latency_ms": (1.0, " ms (median)"),
     "memory_bytes": (1e-6, " MB"),
     "offline_s": (1.0, " core-seconds"),
@@ -71,7 +81,7 @@ def worded(verdict: Verdict) -> Verdict:
 
 
 def needs_text(needs: Requirements) -> str:
-    """State limits, such as "error <= 1 % (relative l2, median), latency <= 3 ms (median)"."""
+    """State limits, such as "error <= 1 % (relative L2 error, median), memory <= 9 MB"."""
     limits = (limit_text(name, limit) for name, limit in needs.asked.items())
     return ", ".join(limits) or "nothing in particular"
 
@@ -138,7 +148,7 @@ def beside(verdict: Verdict) -> list[str]:
 def _alternatives(verdict: Verdict, choice: Row) -> list[str]:
     other, cheapest = verdict.runner_up, verdict.cheapest
     undecided = ", ".join(_named(row) for row in verdict.undecided)
-    lines = [f"Runner-up: {_short(other)}." if other else "No other method qualifies."]
+    lines = [f"{RUNNER_UP.capitalize()}: {_short(other)}." if other else NO_RUNNER_UP]
     if undecided:
         lines.append(f"Cannot be told apart from the winner in latency: {undecided}.")
     if cheapest is not None:

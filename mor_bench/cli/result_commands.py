@@ -32,8 +32,7 @@ from mor_bench.report.console_tables import finding_lines, print_tables, sentenc
 from mor_bench.report.line_wrapping import wrapped
 from mor_bench.report.number_format import explain_short_names
 from mor_bench.report.page import render
-from mor_bench.report.short_names import short_names
-from mor_bench.report.verdict_words import in_words
+from mor_bench.report.short_names import renamed, short_names
 from mor_bench.runs.plan import plan
 from mor_bench.specs.method_spec import Told
 
@@ -164,7 +163,7 @@ def _lines(chosen: Verdict, width: int, *, quiet: bool) -> Iterator[str]:
     """Yield the verdict in lines of this width: the headline, its figures, all else."""
     names = short_names(chosen.rows)
     if quiet:
-        yield from wrapped(in_words(chosen.headline, names), width, names=names.values())
+        yield from wrapped(renamed(chosen.headline, names), width, names=names.values())
         return
     yield from finding_lines(chosen.headline, names, width)
     for line in chosen.evidence:
@@ -172,7 +171,7 @@ def _lines(chosen: Verdict, width: int, *, quiet: bool) -> Iterator[str]:
         first = (
             name[0] if name and line.startswith("    ") else " " * (len(line) - len(line.lstrip()))
         )
-        text = in_words(line, names)[len(first) :]
+        text = renamed(line, names)[len(first) :]
         yield from wrapped(text, width, " " * len(first), first=first, names=names.values())
     yield from sentence_lines(chosen.headline, chosen.beside, names, width)
     swept = explain_short_names(row.swept for row in chosen.rows)

@@ -11,20 +11,20 @@ from typing import Any
 from pydantic.fields import FieldInfo
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.selection_text import ERROR
 from mor_bench.errors import MissingDependencyError
 from mor_bench.measure.discretisation_error import measured
 from mor_bench.measure.mesh_limit import known_error
 from mor_bench.options import allowed_values
 from mor_bench.report.entries import dataset_names, verdict_of
 from mor_bench.report.number_format import bytes_text, metres, percent, seconds_text
-from mor_bench.report.short_names import short_names
+from mor_bench.report.short_names import renamed, short_names
 from mor_bench.report.suite_overview import (
     dataset_family,
     dataset_needs,
     method_family,
     method_needs,
 )
-from mor_bench.report.verdict_words import ERROR, in_words
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.file_check import check_file
 from mor_bench.snapshots.test_sets import available_sets
@@ -70,7 +70,7 @@ def run_card(comparison: Comparison) -> Card:
     for dataset in dataset_names(comparison):
         names = short_names(row for row in comparison.rows if row.dataset == dataset)
         headline = verdict_of(analysis, dataset).get("headline", "no configuration")
-        facts[f"verdict on {dataset}"] = in_words(headline, names)
+        facts[f"verdict on {dataset}"] = renamed(headline, names)
     rows = ", ".join(f"{n} {status}" for status, n in counts.items())
     facts |= {
         "configurations": f"{len(comparison.rows)} ({rows})" if rows else "none",

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.selection_text import ERROR
 from mor_bench.analysis.told import LEGEND
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.aligned_lines import Line, aligned_lines
@@ -46,7 +47,6 @@ from mor_bench.report.speed_tables import (
 )
 from mor_bench.report.summary import hidden_doubts, interval_basis, notes_of, origins, warnings_of
 from mor_bench.report.text_table import TextTable, with_information, with_short_names
-from mor_bench.report.verdict_words import ERROR, in_words
 from mor_bench.results.comparison import Comparison
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
 
 def finding_lines(headline: str, names: Mapping[str, ShortName], width: int) -> list[str]:
     """Return the finding of a verdict's headline, with short names."""
-    finding = in_words(headline, names).partition(". ")[2]
+    finding = renamed(headline, names).partition(". ")[2]
     return wrapped(finding, width, names=names.values())
 
 
@@ -144,7 +144,7 @@ def sentence_lines(
 ) -> Iterator[str]:
     """Yield the needs of a verdict's headline and all other sentences, with short names."""
     for sentence in (f"{headline.partition('. ')[0]}.", *sentences):
-        text, again, command = in_words(sentence, names).partition(AGAIN)
+        text, again, command = renamed(sentence, names).partition(AGAIN)
         text += again.rstrip()
         yield from wrapped(f"- {text}", width, "  ", names=names.values())
         if again:
@@ -248,7 +248,7 @@ def _wide_parts(
     yield from _titled("Figures of the winner, or of the nearest without a winner")
     names = short_names(entry.row for entry in entries)
     for line in verdict_of(analysis, dataset)["evidence"]:
-        yield Text(in_words(line, names), no_wrap=True)
+        yield Text(renamed(line, names), no_wrap=True)
     for kind in ("time_at_error", "error_at_time"):
         yield from _target_parts(target_table(comparison, dataset, kind, analysis))
     basis = [interval_basis(dataset, analysis), "Nothing is extrapolated."]
@@ -270,7 +270,7 @@ def print_tables(
             if detail.quiet:
                 names = short_names(row for row in comparison.rows if row.dataset == name)
                 headline = verdict_of(analysis, name).get("headline", f"{name}: no configuration.")
-                for line in _wrapped(in_words(headline, names), console.width, names=names):
+                for line in _wrapped(renamed(headline, names), console.width, names=names):
                     _print(line, console)
                 continue
             for part in _dataset_parts(comparison, name, analysis, console, detail):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mor_bench.analysis.selection_text import ERROR
 from mor_bench.report.entries import Entry
 from mor_bench.report.number_format import percent
-from mor_bench.report.verdict_words import ERROR
 from mor_bench.results.comparison import Comparison
 
 IN_RANGE = "in-range"

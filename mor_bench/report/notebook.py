@@ -22,8 +22,7 @@ from mor_bench.report.entries import (
     entries_of,
     verdict_of,
 )
-from mor_bench.report.short_names import constants, short_names
-from mor_bench.report.verdict_words import in_words
+from mor_bench.report.short_names import constants, renamed, short_names
 from mor_bench.results import comparison as results
 from mor_bench.runs import compare
 from mor_bench.runs.listener import Listener
@@ -129,7 +128,7 @@ class Comparison(results.Comparison):
         assert self.analysis is not None
         entries = entries_of(self, dataset, self.analysis)
         names = short_names(entry.row for entry in entries)
-        headline = in_words(
+        headline = renamed(
             verdict_of(self.analysis, dataset).get("headline", "No configuration."), names
         )
         headings = ["configuration", *(heading.replace("\n", " ") for heading in MAIN)]

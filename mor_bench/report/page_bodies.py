@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.analysis.selection_text import ERROR
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.page_samples import Sampled, outline
 from mor_bench.report.page_worst import LOAD_OF_KIND
 from mor_bench.report.projection import normals
-from mor_bench.report.verdict_words import ERROR
 from mor_bench.scene.mesh import Mesh
 
 KINDS = ("worst", "typical")

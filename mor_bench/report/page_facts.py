@@ -20,8 +20,7 @@ from mor_bench.report.number_format import bytes_text, number
 from mor_bench.report.page_samples import dataset_arrays
 from mor_bench.report.scene_text import recorded_scene
 from mor_bench.report.short_names import renamed, short_names
-from mor_bench.report.summary import discretisation_error
-from mor_bench.report.verdict_words import needs_in_words
+from mor_bench.report.summary import discretisation_error, needs_in_words
 from mor_bench.results.comparison import Comparison
 
 

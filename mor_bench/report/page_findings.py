@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from mor_bench.analysis.selection_text import ERROR
 from mor_bench.report.number_format import number, whole
-from mor_bench.report.verdict_words import ERROR
 
 Data = Mapping[str, Any]
 

@@ -10,7 +10,8 @@ from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.entries import Entry, dataset_names, entries_of, most_accurate, verdict_of
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.page_sections import View
-from mor_bench.report.verdict_words import in_words, needs_in_words
+from mor_bench.report.short_names import renamed
+from mor_bench.report.summary import needs_in_words
 
 Link = tuple[str, str]
 """Address and text."""
@@ -51,7 +52,7 @@ def standings(view: View, files: Mapping[str, Mapping[str, str]]) -> Standings:
     datasets, columns = [], []
     for name in dataset_names(comparison):
         verdict = verdict_of(view.analysis, name).get("headline", "No configuration was run.")
-        finding = in_words(verdict, view.names[name]).partition(". ")[2] or verdict
+        finding = renamed(verdict, view.names[name]).partition(". ")[2] or verdict
         needs = needs_in_words(needs_of(comparison, name))
         datasets.append(((files["dataset"][name], name), needs, finding))
         columns.append(entries_of(comparison, name, view.analysis))

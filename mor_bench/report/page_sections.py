@@ -32,9 +32,8 @@ from mor_bench.report.page_worst import worst_cases
 from mor_bench.report.scene_text import scene_text
 from mor_bench.report.short_names import ShortName, constants, renamed
 from mor_bench.report.speed_tables import target_table
-from mor_bench.report.summary import interval_basis, notes_of, warnings_of
+from mor_bench.report.summary import interval_basis, needs_in_words, notes_of, warnings_of
 from mor_bench.report.text_table import TextTable, with_information, with_short_names
-from mor_bench.report.verdict_words import needs_in_words
 from mor_bench.report.whole_cost import costs_of
 from mor_bench.results.comparison import Comparison
 

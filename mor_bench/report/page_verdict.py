@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
+from mor_bench.analysis.selection_text import NO_RUNNER_UP, RUNNER_UP
 from mor_bench.report.entries import Entry, most_accurate
 from mor_bench.report.number_format import DASH, number, percent, span, whole
-from mor_bench.report.verdict_words import NO_RUNNER_UP, RUNNER_UP, in_words
+from mor_bench.report.short_names import renamed
 from mor_bench.report.whole_cost import Costs
 
 MESH_MEANING = (
@@ -110,7 +111,7 @@ def card(
             _by_latency(qualified, verdict["runner_up"], undecided, names, (entries, known)),
             _by_offline(qualified, verdict["cheapest"], names),
         ]
-    headline = in_words(verdict["headline"], names)
+    headline = renamed(verdict["headline"], names)
     return Card(
         rankings,
         rankings[0].title if rankings else headline.split(". ", 1)[-1],
@@ -118,8 +119,8 @@ def card(
         mesh,
         stability,
         command,
-        [in_words(sentence, names) for sentence in sentences],
-        [in_words(line, names) for line in verdict["evidence"]],
+        [renamed(sentence, names) for sentence in sentences],
+        [renamed(line, names) for line in verdict["evidence"]],
     )
 
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.analysis.selection_text import ERROR
 from mor_bench.report.number_format import number, percent
-from mor_bench.report.verdict_words import ERROR
 
 NEEDED = {"relative_l2", "max_nodal_m", "amplitude_m"}
 """Names of the raw samples that the sentences need."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mor_bench.analysis.selection_text import needs_text
+from mor_bench.analysis.verdict import Requirements
 from mor_bench.report.entries import Analysis, Entry, entries_of
 from mor_bench.report.number_format import metres, number, percent
 from mor_bench.report.published_figures import SCENES, scene_of
@@ -139,3 +141,8 @@ def discretisation_error(entries: Sequence[Entry]) -> str:
     relative = row.discretisation_rel_l2
     beside = "" if relative is None else f", relative L2 error {percent(relative)} % (median)"
     return f"{least}{metres(row.discretisation_error_m)} m{beside}; {MESH_NOTE}"
+
+
+def needs_in_words(needs: Requirements) -> str:
+    """State limits as the page shows them."""
+    return needs_text(needs).replace("<=", "≤")

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from mor_bench.analysis.selection_text import ERROR
 from mor_bench.report.canvas import (
     DPI,
     GREY,
@@ -35,7 +36,6 @@ from mor_bench.report.number_format import number, percent
 from mor_bench.report.projection import View, normals
 from mor_bench.report.rendering import WIRE, Look, Shot, show_shots
 from mor_bench.report.short_names import short_names
-from mor_bench.report.verdict_words import ERROR
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.mesh import Mesh
 

@@ -19,6 +19,7 @@ from mor_bench.surrogates.field_network import (
     linear,
     n_products,
     perceptron,
+    scaled_positions,
 )
 from mor_bench.surrogates.field_surrogate import Arrays, Input
 from mor_bench.surrogates.graph_coarsening import GraphLevel
@@ -186,9 +187,7 @@ class GraphUNet(MeshNetwork):
         super().__init__(mesh, fixed_nodes)
         widths = [width * min(2**level, WIDEST) for level in range(levels + 1)]
         graphs, groupings = self._coarsened(mesh, levels)
-        low, high = mesh.bounds
-        positions = (mesh.points[self.graph.order.numpy()] - (low + high) / 2) / (high - low).max()
-        places = torch.cat([self.fixed, torch.from_numpy(2.0 * positions).float()], dim=1)
+        places = torch.cat([self.fixed, scaled_positions(mesh)[self.graph.order]], dim=1)
         self.field, self.place = linear(3, width), MeshTerm(places, width)
         self.encoder = linear(width, width)
         self.down, self.up = (

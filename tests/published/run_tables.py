@@ -13,7 +13,6 @@ from mor_bench.analysis.told import class_text, is_observed
 from mor_bench.report.entries import entries_of
 from mor_bench.report.number_format import DASH, number, percent, short_swept
 from mor_bench.report.paper_tables import against_the_paper
-from mor_bench.report.verdict_words import in_words
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import ErrorSummary
 from mor_bench.results.row import Row
@@ -227,7 +226,7 @@ def verdict(source: str, dataset: str = "") -> str:
     (found,) = [v for v in (run.analysis or {})["verdicts"] if v["dataset"] == name]
     beside = [line for line in found["beside"] if not line.startswith("Evidence:")]
     beside = [line.partition(" Time again:")[0] for line in beside]
-    return "\n".join([in_words(found["headline"]), *(f"- {in_words(line)}" for line in beside)])
+    return "\n".join([found["headline"], *(f"- {line}" for line in beside)])
 
 
 def headline(source: str, dataset: str = "") -> str:
