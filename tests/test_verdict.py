@@ -262,6 +262,12 @@ def test_a_suggested_relaxation_is_the_smallest_that_is_enough(
             assert qualifies(error=shown * (1 + 1e-15))
 
 
+def test_a_bound_just_above_its_limit_is_never_rounded_onto_it() -> None:
+    just = a_row("just", error={"rel_l2_median": 0.010046})
+    text = choose([just], Requirements(0.01, 3.0, 1e9), "d").text()
+    assert "error 1.01 times the limit" in text
+
+
 def test_without_a_choice_the_text_names_the_limits_to_relax() -> None:
     slow = a_row("exact", latency_ms={"median": 11.9, "high": 12.34}, error={"rel_l2_median": 1e-6})
     rough = a_row("rough", error={"rel_l2_median": 0.02})

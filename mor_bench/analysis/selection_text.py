@@ -44,7 +44,7 @@ _UNITS = {
 def limit_text(name: str, limit: float, round_up: bool = False) -> str:
     """Return a limit with its unit, such as "latency <= 3 ms (median)"."""
     scale, unit = _UNITS[name]
-    value = _rounded_up(scale * limit) if round_up else f"{scale * limit:g}"
+    value = _sufficient(scale * limit) if round_up else f"{scale * limit:g}"
     return f"{FIGURE_NAMES[name]} <= {value}{unit}"
 
 
@@ -55,16 +55,23 @@ def limits_missed(bounds: Mapping[str, float], needs: Requirements) -> list[tupl
         if bounds[name] > limit:
             scale, unit = _UNITS[name]
             said = unit.partition(" (")[0]
-            bound = f"{scale * bounds[name]:.3g}{said}" if bounds[name] < inf else "unknown"
+            value = bounds[name]
+            bound = f"{_rounded_up(scale * value)}{said}" if value < inf else "unknown"
             out.append((FIGURE_NAMES[name], bound, f"{scale * limit:g}{said}"))
     return out
 
 
-def _rounded_up(value: float, digits: int = 3) -> str:
+def _rounded_up(value: float) -> str:
+    """Return a number that is rounded up to three digits, but for an excess of rounding errors."""
     if not 0 < value < inf:
         return f"{value:g}"
-    step = 10.0 ** (floor(log10(value)) - digits + 1)
-    text = f"{ceil(value / step - 1e-9) * step:.{digits}g}"
+    step = 10.0 ** (floor(log10(value)) - 2)
+    return f"{ceil(value / step - 1e-9) * step:.3g}"
+
+
+def _sufficient(value: float) -> str:
+    """Return a number that is rounded up and at least as large as the value."""
+    text = _rounded_up(value)
     return text if float(text) >= value else f"{value:.17g}"
 
 
@@ -182,7 +189,7 @@ def _misses(verdict: Verdict) -> str:
     bounds = verdict.figures[verdict.nearest.label]
     factors = {name: bounds[name] / limit for name, limit in verdict.requirements.asked.items()}
     return ", ".join(
-        f"{FIGURE_NAMES[name]} {factor:.3g} times the limit"
+        f"{FIGURE_NAMES[name]} {_rounded_up(factor)} times the limit"
         for name, factor in factors.items()
         if factor > 1
     )
