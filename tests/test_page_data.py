@@ -161,13 +161,16 @@ def test_the_worst_loads_are_told_apart() -> None:
         "amplitude_m": np.array([0.0076, 0.15, 0.46]),
     }
     middle, relative, absolute = worst_cases(arrays)
-    assert middle == "Middle (medians): 1.9 %, 0.4 mm at the worst node, moves 150 mm."
+    assert middle == (
+        "Medians of the test loads: relative L2 error 1.9 %, "
+        "largest error at a node 0.4 mm, largest displacement 150 mm."
+    )
     assert relative == (
         "Largest relative L2 error of all test loads: 5 % "
-        "(a small load, test load 0, moves 7.6 mm)."
+        "(a small load, test load 0, largest displacement 7.6 mm)."
     )
     assert absolute == (
-        "Largest error in mm: 11.4 mm at a node (test load 2, 1.9 %, moves 460 mm)."
+        "Largest error in mm: 11.4 mm at a node (test load 2, 1.9 %, largest displacement 460 mm)."
     )
     bodies = "Largest mean error e, drawn under Deformed bodies: "
     for e, said in (

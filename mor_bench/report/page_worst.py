@@ -42,12 +42,13 @@ def worst_cases(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
     i, j = int(np.argmax(relative)), int(np.argmax(nodal))
     small = "a small load, " if moved[i] < np.median(moved) / 2 else ""
     said = [
-        f"Middle (medians): {percent(float(np.median(relative)))} %, "
-        f"{_mm(np.median(nodal))} at the worst node, moves {_mm(np.median(moved))}.",
+        f"Medians of the test loads: {ERROR} {percent(float(np.median(relative)))} %, "
+        f"largest error at a node {_mm(np.median(nodal))}, "
+        f"largest displacement {_mm(np.median(moved))}.",
         f"Largest {ERROR} of all test loads: {percent(float(relative[i]))} % "
-        f"({small}test load {i}, moves {_mm(moved[i])}).",
+        f"({small}test load {i}, largest displacement {_mm(moved[i])}).",
         f"Largest error in mm: {_mm(nodal[j])} at a node (test load {j}, "
-        f"{percent(float(relative[j]))} %, moves {_mm(moved[j])}).",
+        f"{percent(float(relative[j]))} %, largest displacement {_mm(moved[j])}).",
     ]
     if "mean_dof_m" in arrays:
         k = int(np.argmax(arrays["mean_dof_m"]))
