@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.verdict import Requirements
 from mor_bench.machine import describe_machine
+from mor_bench.report.caveat_tables import error_bounds
 from mor_bench.report.entries import Entry, entries_of
 from mor_bench.report.not_measured import unmeasured
 from mor_bench.report.number_format import joined_units, unbroken
@@ -28,7 +30,7 @@ from mor_bench.report.page_tables import run_again
 from mor_bench.report.scene_text import scene_text
 from mor_bench.report.summary import interval_basis, paper_size
 from mor_bench.results.parts import ErrorSummary
-from mor_bench.results.row import SetErrors
+from mor_bench.results.row import BoundQuality, SetErrors
 from mor_bench.runs.run_folder import record_commit
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import list_suite, load_dataset_spec
@@ -65,6 +67,7 @@ def test_the_validation_part_and_its_interval_give_the_reason() -> None:
     unsure = Entry(row, intervals={"validation_rel_l2_median": (0.002, 0.0118)})
     assert answer_of(sure, NEEDS) == "no"
     assert reason_of(unsure, NEEDS) == "no: error: upper bound 1.18 %, limit 1 %"
+    assert answer_of(unsure, NEEDS) == "no: validation error up to 1.18 %"
 
 
 @pytest.mark.parametrize("name", list_suite("datasets"))
@@ -124,6 +127,13 @@ def test_the_page_tells_how_to_run_again_and_what_was_not_tested(tmp_path: Path)
     assert all(line.endswith(f": {full}.") for line in (learning, beyond))
     run.settings.update(profile="full")
     assert unmeasured(run, "beam-tiny", entries) == []
+    bound = BoundQuality(level=0.9, relative_l2=inf, n=20, n_groups=2)
+    finite = bound.model_copy(update={"relative_l2": 0.1})
+    unbounded = [Entry(entries[0].row.with_parts(bound=bound))]
+    (few,) = unmeasured(run, "beam-tiny", unbounded)
+    assert few.startswith("Calibrated error bounds: ")
+    assert error_bounds(unbounded) is None
+    assert error_bounds([Entry(entries[0].row.with_parts(bound=finite))])
     run.settings.update(profile="quick")
     sets = {name: SetErrors(n=9, rel_l2_median=e) for name, e in (("in-range", 0.01), ("2x", 0.08))}
     tested = [Entry(entries[0].row.with_parts(sets=sets))]

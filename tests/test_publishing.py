@@ -27,11 +27,13 @@ from tests.published.claims import (
 from tests.published.compact import (
     ERRORS,
     compact,
+    reword,
     verdict_again,
     wrong_conclusions,
     wrong_summaries,
     wrong_verdicts,
 )
+from tests.published.literature_table import literature
 from tests.published.pictures import draw_pictures, stale_pictures
 from tests.published.stored import REPORTS, EvidenceError, content_of, look_up, run_of
 from tests.synthetic import synthetic_comparison
@@ -82,6 +84,36 @@ def test_a_verdict_that_its_rows_do_not_give_is_found(stored: Path, tmp_path: Pa
     outside, order = wrong_verdicts(tmp_path / "copy")
     assert "rel_l2_median lies outside its interval" in outside
     assert "qualify, stated are" in order
+
+
+def test_stored_verdicts_are_worded_as_the_code_does(stored: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(stored, tmp_path / "copy")
+    assert not reword(folder)
+    path = folder / "comparison.json"
+    now = path.read_text()
+    content = json.loads(now)
+    verdict = content["verdicts"][0]
+    verdict["headline"] = "An old headline."
+    lines = verdict["beside"]
+    verdict["beside"] = [f"old {line}" if "Best when" in line else line for line in lines]
+    path.write_text(json.dumps(content))
+    content_of.cache_clear()
+    assert len(list(wrong_verdicts(folder))) > 1
+    assert reword(folder)
+    assert path.read_text() == now
+    content_of.cache_clear()
+    assert list(wrong_verdicts(folder)) == []
+
+
+def test_the_table_of_literature_needs_the_experiment_of_its_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (REPORTS / "literature.toml").read_text()
+    assert literature("reports/literature.toml").count("\n") == 1 + text.count("[[number]]")
+    wrong = text.replace('experiment = "full-order/peers.json"', 'experiment = "quick-start"')
+    (tmp_path / "wrong.toml").write_text(wrong)
+    with pytest.raises(EvidenceError, match=r"peers\.json is not of an experiment 'quick-start'"):
+        literature(str(tmp_path / "wrong.toml"))
 
 
 def forged(stored: Path, folder: Path, part: str, factor: float) -> Path:

@@ -318,7 +318,7 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
         "Error per degree of freedom (m)",
         "Offline cost",
         "Nodal error and error over deformation",
-        "Error at the tip (%)",
+        "Error at the tip, the node that moves most (%)",
         "Size and samples",
         "In its regime",
     ]

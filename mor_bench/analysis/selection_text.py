@@ -30,7 +30,7 @@ RUNNER_UP = "runner-up (another method)"
 """What the second is: the fastest, or by offline cost the cheapest, of those that qualify. A
 configuration of the winner's own method is none."""
 
-NO_RUNNER_UP = "No other method qualifies."
+NO_RUNNER_UP = "No other method that was tried qualifies."
 """What is said where there is no runner-up."""
 
 _UNITS = {
@@ -165,7 +165,9 @@ def _alternatives(verdict: Verdict, choice: Row) -> list[str]:
         brief = cost is not None and cost < CHANCE_S
         lines.append(f"Cheapest offline: {name}, {_core_seconds(cost)}.{chance * brief}")
     for told, best in verdict.best_told.items():
-        name = "none qualifies" if best is None else _short(best)
+        near = verdict.nearest_told.get(told)
+        missed = f"none qualifies{f'; the nearest is {_short(near)}' if near else ''}"
+        name = missed if best is None else _short(best)
         lines.append(f"Best when told {told_text(told, verdict.observed)}: {name}.")
     return lines
 

@@ -109,6 +109,8 @@ class Verdict:
         Without a winner: the limits that suffice if relaxed alone.
     nearest : Row or None
         Without a winner: the configuration that exceeds the limits by the smallest factor.
+    nearest_told : dict
+        The same among those of each class of information.
     unknown : list of str
         Without a winner: requirements on a figure that no configuration has.
     n_without_answers : int
@@ -148,6 +150,7 @@ class Verdict:
     undecided: Sequence[Row] = ()
     relaxations: Sequence[Relaxation] = ()
     nearest: Row | None = None
+    nearest_told: Mapping[Told | None, Row | None] = field(default_factory=dict)
     unknown: Sequence[str] = ()
     n_without_answers: int = 0
     figures: Figures = field(default_factory=dict)

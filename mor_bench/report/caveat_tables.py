@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import isfinite
 from typing import Any
 
 from mor_bench.report.entries import Analysis, Entry
@@ -88,8 +89,11 @@ def _recall_cell(found: SetErrors | FlagCounts, median: float) -> str:
 
 
 def error_bounds(entries: Sequence[Entry]) -> TextTable | None:
-    """Build the table of calibrated error bounds and their coverage of each test set."""
-    bounded = [entry for entry in entries if entry.row.bound]
+    """Build the table of calibrated error bounds and their coverage of each test set.
+
+    Infinite bounds are left out: `not_measured.unmeasured` mentions them.
+    """
+    bounded = [e for e in entries if e.row.bound and isfinite(e.row.bound.relative_l2)]
     if not bounded:
         return None
     names = dict.fromkeys(name for e in bounded if e.row.bound for name in e.row.bound.coverage)
@@ -110,7 +114,7 @@ def error_bounds(entries: Sequence[Entry]) -> TextTable | None:
     note = (
         f"Bound: {level} % of new loads have at most this relative L2 error, if they are like the "
         "validation loads. It is calibrated on them by split-conformal prediction, with load "
-        "regions as groups; with too few groups it is infinite. Other columns: the share of each "
+        "regions as groups. Other columns: the share of each "
         "test set within the bound (%)."
     )
     headings = ["configuration", "bound (%)", "samples in groups", *names]
@@ -164,7 +168,7 @@ def tuning_table(dataset: str, analysis: Analysis) -> TextTable | None:
         "Configurations and fitting time of each method, out of the common tuning budget. "
         "Trainings elsewhere have no time here."
     )
-    headings = ["method", "configurations", "fitting (s)"]
+    headings = ["method", "configurations", "fitting, wall time (s)"]
     return TextTable("Tuning budget", note, headings, rows) if rows else None
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.report.number_format import DASH, number, percent
-from mor_bench.report.page_samples import Sampled
+from mor_bench.report.page_samples import Sampled, has_error
 from mor_bench.report.text_table import TextTable
 
 N_WORST, N_SHARED = 3, 5
@@ -23,11 +23,11 @@ NUMBERS = "Numbers count the test loads from 0, as in the raw files. "
 
 
 def hardest_loads(found: Sequence[Sampled], arrays: Mapping[str, NDArray[Any]]) -> list[TextTable]:
-    """Build both tables from configurations with raw samples; references are left out."""
+    """Build both tables from configurations with raw samples; exact references are left out."""
     compared = [
         item
         for item in found
-        if not item.entry.row.reference
+        if has_error(item.entry)
         and {"relative_l2", "mean_dof_m", "amplitude_m"} <= set(item.arrays)
     ]
     if not compared:

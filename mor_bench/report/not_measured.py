@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 
 from mor_bench.analysis.selection_text import ERROR
 from mor_bench.report.entries import Entry
@@ -37,10 +38,12 @@ def beyond_training(
 
 def unmeasured(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[str]:
     """List what a full comparison adds to this one, each with the command."""
+    found = []
+    if any(entry.row.bound and not isfinite(entry.row.bound.relative_l2) for entry in entries):
+        found.append("Calibrated error bounds: the validation part has too few load regions.")
     command = _full_command(comparison, dataset)
     if not command or not any(entry.ran for entry in entries):
-        return []
-    found = []
+        return found
     if not any(point.dataset == dataset for point in comparison.learning):
         found.append(f"Learning curves, the error over the number of training samples: {command}.")
     if not any(set(entry.row.sets) - {IN_RANGE} for entry in entries):

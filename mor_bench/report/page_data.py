@@ -19,6 +19,7 @@ from mor_bench.report.page_samples import (
     dataset_arrays,
     deformations,
     distributions,
+    has_error,
     losses,
     mesh_of,
     positions,
@@ -48,7 +49,7 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
     comparison, dataset, entries = shown.comparison, shown.dataset, shown.entries
     picks = [pick.entry for ranking in shown.card.rankings for pick in ranking.picks]
     found = sampled(comparison, entries, picks)
-    methods = [item for item in found if not item.entry.row.reference]
+    compared = [item for item in found if has_error(item.entry)]
     arrays = dataset_arrays(comparison, dataset)
     mesh = mesh_of(arrays)
     needs = needs_of(comparison, dataset)
@@ -67,7 +68,7 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
         "rows": [_row(comparison, entry, shown.names, needs) for entry in entries],
         "order": [entry.label for entry in sorted(entries, key=reading_order)],
         "distributions": distributions(found),
-        "deformations": deformations(methods),
+        "deformations": deformations(compared),
         "positions": positions(found, arrays, mesh),
         "singular": singular_values(arrays, needs.error),
         "ranks": _ranks(entries),

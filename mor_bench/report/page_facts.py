@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mor_bench.analysis.selection import asked_of, bounds_of
-from mor_bench.analysis.selection_text import limits_missed, run_command
+from mor_bench.analysis.selection_text import FIGURE_NAMES, limits_missed, run_command
 from mor_bench.analysis.verdict import Requirements, needs_of
 from mor_bench.measure.discretisation_error import measured
 from mor_bench.report.cards import pair_text
@@ -25,10 +25,14 @@ from mor_bench.results.comparison import Comparison
 
 
 def answer_of(entry: Entry, needs: Requirements) -> str:
-    """Say whether a configuration qualifies, or why not: "no: error up to 2 %"."""
+    """Say whether a configuration qualifies, or why not: "no: validation error up to 2 %"."""
     if entry.qualified or not entry.ran:
         return "yes" if entry.qualified else entry.row.status
-    missed = [f"{name} up to {bound}" for name, bound, _ in _missed(entry, needs)]
+    on = "validation " if entry.row.validation else ""
+    missed = [
+        f"{on if name == FIGURE_NAMES['error'] else ''}{name} up to {bound}"
+        for name, bound, _ in _missed(entry, needs)
+    ]
     missed += ["loads without an answer"] if entry.n_failed else []
     return f"no: {', '.join(missed)}" if missed else "no"
 
@@ -187,6 +191,7 @@ def facts_of(
             "samples refused by the full-order model (no stable equilibrium found)",
             "not recorded" if refused is None else f"{int(refused):,}, in no part of the split",
         ),
+        *([] if spec.get("snapshots") else [("reference solutions", _REFERENCE)]),
         ("needs", needs_in_words(needs_of(comparison, dataset))),
         ("degrees of freedom", _values(f"{row.n_dofs:,}" for row in rows if row.n_dofs)),
         ("discretisation error of the dataset's mesh", discretisation_error(entries)),
@@ -218,7 +223,9 @@ def protocol_of(comparison: Comparison, dataset: str, entries: Sequence[Entry]) 
     budget = comparison.settings.get("budget") or {}
     allowed = [f"{budget['configurations']} configurations"] if budget.get("configurations") else []
     allowed += [f"{budget['seconds']:g} s of fitting"] if budget.get("seconds") else []
-    text = f"One query at a time, {threads} thread{'s' * (threads != '1')}, after warm-up, in "
+    cores = comparison.machine.get("cores")
+    of = f" on {cores} cores" if cores else ""
+    text = f"One query at a time, {threads} thread{'s' * (threads != '1')}{of}, after warm-up, in "
     text += f"{processes} fresh process{'es' * (processes != '1')}{turns}."
     return f"{text} Budget of each method: {' and '.join(allowed)}." if allowed else text
 
@@ -250,6 +257,8 @@ def _refinement(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
     text += f"; limit by Richardson extrapolation for {n} loads, else the finest mesh"
     return [("how it was measured", text)]
 
+
+_REFERENCE = "full-order model on this mesh, residual at most 1e-8 of the load"
 
 _SCENE = {
     "geometry": "geometry",

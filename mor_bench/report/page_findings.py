@@ -138,14 +138,16 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         "positions",
         _position,
         "Each dot is a load patch on the body. Its colour is the median relative L2 error of the "
-        "test loads there. Hollow dots have no test load.",
+        "test loads there. Hollow dots are patches without a test load: those of the training "
+        "and the validation part.",
     ),
     "deformations": (
         "Error against deformation",
         "deformations",
         _deformation,
-        "Lines: medians of e (mean absolute error per degree of freedom) in ten groups of test "
-        "loads, by the largest displacement of the reference. Dots: the test loads of one method.",
+        "Lines: medians of e (mean absolute error over all degrees of freedom, those of the "
+        "supports too) in ten groups of test loads, by the largest displacement of the reference. "
+        "Dots: the test loads of one method.",
     ),
     "distributions": (
         "Distribution of errors and latencies",

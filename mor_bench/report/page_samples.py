@@ -22,6 +22,9 @@ MOST_STEPS = 160
 MOST_DOTS = 300
 """Most test samples of a method in the chart of deformations."""
 
+EXACT = 1e-6
+"""With a smaller median error, a reference repeats the solutions that it is compared with."""
+
 N_BINS = 10
 CREASE = 0.85
 """Edges whose facets' normals have a smaller cosine are drawn."""
@@ -84,15 +87,20 @@ def distribution(values: Any) -> dict[str, Any]:
     return {"x": rounded(finite[chosen]), "share": rounded((chosen + 1) / n), "n": n}
 
 
+def has_error(entry: Entry) -> bool:
+    """Tell whether a configuration has an error of its own; an exact reference has none."""
+    return not (entry.row.reference and entry.error < EXACT)
+
+
 def distributions(found: Sequence[Sampled]) -> list[dict[str, Any]]:
     """Return the distributions of error (%) and latency (ms) of each configuration."""
     return [
         {
             "label": item.entry.label,
             "error": distribution(
-                ()  # a reference has no error of its own
-                if item.entry.row.reference
-                else 100 * np.asarray(item.arrays.get("relative_l2", ()))
+                100 * np.asarray(item.arrays.get("relative_l2", ()))
+                if has_error(item.entry)
+                else ()
             ),
             "latency": distribution(item.arrays.get("latency_ms", ())),
         }

@@ -55,7 +55,7 @@ GROUPS: dict[str, dict[str, Cell]] = {
         "slope": figure_cell("error", "slope", metres),
         "largest u (m)": figure_cell("error", "amplitude_m"),
     },
-    "Error at the tip (%)": {
+    "Error at the tip, the node that moves most (%)": {
         "median": figure_cell("error", "tip_rel_median", percent),
         "p95": figure_cell("error", "tip_rel_p95", percent),
         "max": figure_cell("error", "tip_rel_max", percent),
@@ -76,7 +76,7 @@ GROUPS: dict[str, dict[str, Cell]] = {
     "Size and samples": {
         "model": lambda e: bytes_text(e.row.model_bytes),
         "threads": lambda e: str(e.row.threads),
-        "training": lambda e: str(e.row.n_train),
+        "training": lambda e: "none used" if e.row.snapshots is False else str(e.row.n_train),
         "test": lambda e: str(e.row.n_test),
         "without prediction": lambda e: DASH if e.row.n_failed is None else str(e.row.n_failed),
         "discretisation error (m)": _discretisation,

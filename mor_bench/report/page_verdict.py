@@ -14,8 +14,8 @@ from mor_bench.report.short_names import renamed
 from mor_bench.report.whole_cost import Costs
 
 MESH_MEANING = (
-    "For the real body, all configurations with a smaller error rank equal. The ranking and the "
-    "needed error hold for this mesh's own solution."
+    "For the real body, this comparison cannot rank configurations with a smaller error. The "
+    "ranking and the needed error hold for this mesh's own solution."
 )
 """What a discretisation error means for the ranking."""
 
@@ -33,6 +33,7 @@ class Pick:
     error: str
     error_span: str
     tail: str
+    selected: str
     slow: str
     latency: str
     latency_span: str
@@ -169,9 +170,12 @@ def _by_latency(
     if undecided:
         sentence = f"Its latency cannot be told apart from that of {listed(undecided)}."
     elif len(qualified) > 1:
-        sentence = "It is faster than every other configuration that qualifies."
+        sentence = (
+            "It is faster than every other configuration that qualifies: no 95 % interval of the "
+            "ratio of their latencies contains 1."
+        )
     else:
-        sentence = "No other configuration qualifies."
+        sentence = "No other configuration that was tried qualifies."
     sentence += f" {NO_RUNNER_UP}" if second is None and len(qualified) > 1 else ""
     full_order = [e for e in qualified if e.row.reference]
     full_order = full_order or [e for e in entries if e.row.reference and e.ran]
@@ -250,6 +254,7 @@ def _pick(part: str, entry: Entry, names: Mapping[str, str]) -> Pick:
         percent(entry.figure("error", "rel_l2_median")),
         _interval(entry, "rel_l2_median", percent),
         _error_tail(entry),
+        _selected_by(entry),
         _latency_tail(entry),
         number(entry.figure("latency_ms", "median")),
         _interval(entry, "latency_ms", number),
@@ -262,7 +267,23 @@ def _error_tail(entry: Entry) -> str:
     p95, worst = (entry.figure("error", name) for name in ("rel_l2_p95", "rel_l2_max"))
     if p95 is None or worst is None:
         return ""
-    return f"19 of 20 test loads: ≤ {percent(p95)} %; largest relative error: {percent(worst)} %"
+    return (
+        f"95 % of the {entry.row.n_test:,} test loads: ≤ {percent(p95)} %; "
+        f"largest relative error: {percent(worst)} %"
+    )
+
+
+def _selected_by(entry: Entry) -> str:
+    """State the errors on the validation loads, which selected the configuration."""
+    found = entry.row.validation
+    if found is None:
+        return ""
+    figures = (found.rel_l2_median, found.rel_l2_p95, found.rel_l2_max)
+    median, p95, worst = (percent(value) for value in figures)
+    return (
+        f"The {entry.row.n_validation:,} validation loads selected it. There, the median is "
+        f"{median} %, 95 % of them have ≤ {p95} %, the largest is {worst} %."
+    )
 
 
 def _latency_tail(entry: Entry) -> str:

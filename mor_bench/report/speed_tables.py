@@ -32,7 +32,8 @@ TARGETS_NOTE = (
     "Test errors, interpolated along the frontier of a method. The error of the verdict (the 95 % "
     "upper bound on the validation part) selects its configurations: no other one is both faster "
     "and more accurate. In brackets: the configuration that the verdict would choose for the "
-    "target, with its figure on the test set."
+    "target, with its figure on the test set. Small: the 95 % interval of the interpolated value; "
+    "it is not that of the configuration."
 )
 
 FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)

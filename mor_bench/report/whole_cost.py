@@ -59,17 +59,23 @@ class CostLine:
 
 @dataclass(frozen=True)
 class Costs:
-    """The costs at a target error in %; the full-order model, if known, is the first line."""
+    """The costs at a target error in %; the full-order model, if known, is the first line.
+
+    `missed` is the required error in %, where only the full-order model reaches it.
+    """
 
     target: float
     full_order: str | None
     lines: list[CostLine]
+    missed: float | None = None
 
     @property
     def finding(self) -> str:
         """Name the first that pays off; digits of the break-even are few, as fit costs vary."""
         paid = [line for line in self.lines if line.break_even is not None]
         target = f"at {number(self.target)} %"
+        if self.missed is not None:
+            target += f" (none reaches {number(self.missed)} %)"
         if not paid:
             return f"No method is cheaper in the long run than the full-order model {target}"
         best = min(paid, key=lambda line: line.break_even or 0)
@@ -119,7 +125,8 @@ def costs_of(
         for label, n in queries.items()
         if label in by_label and (line := _line(by_label[label], str(names[label]), n))
     ]
-    return Costs(100 * target, full_order, lines) if lines else None
+    missed = 100 * needed if needed and needed < target else None
+    return Costs(100 * target, full_order, lines, missed) if lines else None
 
 
 def _line(entry: Entry, name: str, queries: int | None) -> CostLine | None:

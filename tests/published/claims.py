@@ -6,7 +6,7 @@ each number, and `values` that say where the numbers come from:
     file, key       evidence or TOML file, see `stored.look_up`; or a Python file and its text with
                     `{}` for the number, such as "MAX_CELLS = {}"
     over            key of a divisor in the same file
-    reduce          "median", "min", "max", "len", "sum" or "prod" of a list
+    reduce          "median", "mean", "min", "max", "len", "sum" or "prod" of a list
     scale           factor
     format          Python's format of the number, such as ".2g"; "word" for "ten". Default: ",g"
 
@@ -16,7 +16,7 @@ A `[[stated]]` has texts whose numbers need no source here, and the reason `why`
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,20 +24,11 @@ from typing import Any
 import numpy as np
 
 from tests.published.blocks import BLOCK
-from tests.published.stored import ROOT, EvidenceError, content_of, look_up
+from tests.published.stored import ROOT, EvidenceError, content_of, number_of
 
 CLAIMS = "reports/claims.toml"
 
 EVERY_PAGE = "*"
-
-REDUCE: dict[str, Callable[[Any], float]] = {
-    "median": np.median,
-    "min": np.min,
-    "max": np.max,
-    "len": len,
-    "sum": np.sum,
-    "prod": np.prod,
-}
 
 WHYS = ("paper", "equation", "format", "name", "version", "year", "tested")
 """Reasons why a number needs no source here.
@@ -138,17 +129,9 @@ def statements() -> list[Statement]:
 
 def formatted(value: Mapping[str, Any]) -> str:
     """Look a number up in the evidence and format it for its sentence."""
-    content = content_of(value["file"])
-
-    def measured(key: str) -> float:
-        found = look_up(content, key)
-        return float(REDUCE[value["reduce"]](found) if "reduce" in value else found)
-
-    number = measured(value["key"]) * value.get("scale", 1.0)
-    if "over" in value:
-        number /= measured(value["over"])
+    number = number_of(value)
     if value.get("format") == "word":
-        return IN_WORDS[number]
+        return IN_WORDS[round(number)]
     return re.sub(r"e([-+])0?", r"e\1", format(number, value.get("format", ",g"))).replace(
         "e+", "e"
     )

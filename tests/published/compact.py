@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.draws import Draws, Interval
 from mor_bench.analysis.selection import decide
+from mor_bench.analysis.selection_text import NO_RUNNER_UP, RUNNER_UP
 from mor_bench.analysis.verdict import RULE, Verdict, needs_of
 from mor_bench.measure.error_metrics import ERRORS as FIGURES
 from mor_bench.measure.error_metrics import SampleErrors, summary
@@ -112,10 +113,15 @@ def verdict_again(comparison: Comparison, analysis: Mapping[str, Any], name: str
     return decide(comparison, name, needs_of(comparison, name), Draws([], none, none, intervals))
 
 
+AGAIN, EVIDENCE, UNDECIDED = " Time again: ", "Evidence: ", "Cannot be told apart"
+UNCHECKED = (EVIDENCE, UNDECIDED)
+"""Beginnings of sentences that do not follow from rows and intervals alone."""
+
+
 def _checked(beside: Sequence[str]) -> list[str]:
     """Return the sentences beside a headline that follow from rows and intervals alone."""
-    shown = [line.partition(" Time again: ")[0] for line in beside]
-    return [line for line in shown if not line.startswith(("Cannot be told apart", "Evidence: "))]
+    shown = [line.partition(AGAIN)[0] for line in beside]
+    return [line for line in shown if not line.startswith(UNCHECKED)]
 
 
 def wrong_verdicts(folder: Path) -> Iterator[str]:
@@ -163,6 +169,40 @@ class StoredRun(Comparison):
 
 PARTS = {"validation": "validation_relative_l2", "hidden": "hidden_relative_l2"}
 """Arrays of the relative errors on other samples than those of the test set, by part of a row."""
+
+
+def reword(folder: Path) -> bool:
+    """Word the stored verdicts as the code does now; numbers stay. Return whether a text changed.
+
+    What does not follow from rows and intervals alone is kept as it is stored.
+    """
+    comparison, path = Comparison.read(folder), folder / "comparison.json"
+    analysis = json.loads(path.read_text(encoding="utf-8"))
+    for stored in analysis["verdicts"]:
+        again = verdict_again(comparison, analysis, stored["dataset"])
+        stored["headline"] = again.headline
+        stored["beside"] = _reworded(stored["beside"], again.beside)
+    text = json.dumps(analysis, indent=None, separators=(",", ":"), allow_nan=False) + "\n"
+    changed = text != path.read_text(encoding="utf-8")
+    if changed:
+        write_atomically(path, text.encode())
+    return changed
+
+
+def _reworded(stored: Sequence[str], again: Sequence[str]) -> list[str]:
+    """Take the sentences of `again`, but those on draws, folders and commands from `stored`."""
+    kept = {start: [line for line in stored if line.startswith(start)] for start in UNCHECKED}
+    command = next((line.partition(AGAIN)[2] for line in stored if AGAIN in line), "")
+    lines = []
+    for line in again:
+        if line.startswith(UNCHECKED):
+            lines += kept[EVIDENCE]
+        else:
+            said, with_command, _ = line.partition(AGAIN)
+            lines.append(f"{said}{AGAIN}{command}" if with_command else line)
+        if line.startswith((RUNNER_UP.capitalize(), NO_RUNNER_UP)):
+            lines += kept[UNDECIDED]
+    return lines
 
 
 def wrong_summaries(folder: Path) -> Iterator[str]:

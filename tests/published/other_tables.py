@@ -21,6 +21,7 @@ from tests.published.cost_tables import (
     probe_cost,
     scaling,
 )
+from tests.published.literature_table import literature
 from tests.published.projection_tables import projections, reconstructions
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
@@ -353,6 +354,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "hard-cases": hard_cases,
     "hard-loads": hard_loads,
     "evidence": evidence,
+    "literature": literature,
     "timed-work": timed_work,
     "projections": projections,
     "reconstructions": reconstructions,

@@ -10,7 +10,7 @@ from mor_bench.analysis.break_even import FULL_ORDER, break_even
 from mor_bench.analysis.frontier import median_error, median_latency_ms, number_or_inf
 from mor_bench.analysis.selection_text import CHANCE_S
 from mor_bench.analysis.told import class_text, is_observed
-from mor_bench.report.entries import best_per_method, entries_of
+from mor_bench.report.entries import entries_of
 from mor_bench.report.number_format import DASH, number, percent, short_swept
 from mor_bench.report.paper_tables import against_the_paper
 from mor_bench.results.comparison import Comparison
@@ -286,27 +286,6 @@ def paper(source: str, methods: str = "") -> str:
     return markdown(["scene", headings[0], "is given", "iterations", *headings[1:]], body)
 
 
-def at_amplitude(source: str) -> str:
-    """Show errors on the test part beside those on the test set with the paper's deformation."""
-    run = run_of(source)
-    body = []
-    for name in run.datasets:
-        for row in (e.row for e in best_per_method(entries_of(run, name, run.analysis))):
-            found = row.sets.get("paper-amplitude")
-            if found is None or row.error is None:
-                continue
-            flagged = DASH if found.n_flagged is None else percent(found.n_flagged / found.n)
-            body.append([name, row.label, class_text(row, is_observed(run, name))])
-            for errors in (row.error, found):
-                body[-1] += [number(errors.amplitude_m), _percent(errors.rel_l2_median)]
-                body[-1] += [_percent(errors.rel_l2_p95), number(errors.slope)]
-            body[-1].append(flagged)
-    headings = ["scene", "configuration", "is given"]
-    for part in ("test", "set"):
-        headings += [f"{part}: largest u (m)", "median %", "p95 %", "slope"]
-    return markdown([*headings, "flagged %"], body)
-
-
 PAPER_ITERATIONS = "100,000"
 """Iterations of each network of the paper, as it states them."""
 
@@ -339,6 +318,5 @@ RUN_TABLES: dict[str, Callable[..., str]] = {
     "headline": headline,
     "indicated": indicated,
     "paper": paper,
-    "at-amplitude": at_amplitude,
     "facts": facts,
 }

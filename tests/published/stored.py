@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mor_bench.errors import MorBenchError
 from mor_bench.results.comparison import Comparison
@@ -16,6 +19,17 @@ ROOT = Path(__file__).parents[2]
 """The repository."""
 
 REPORTS = ROOT / "reports"
+
+REDUCE: dict[str, Callable[[Any], float]] = {
+    "median": np.median,
+    "mean": np.mean,
+    "min": np.min,
+    "max": np.max,
+    "len": len,
+    "sum": np.sum,
+    "prod": np.prod,
+}
+"""How a list of numbers becomes one."""
 
 
 class EvidenceError(MorBenchError):
@@ -90,3 +104,15 @@ def run_of(name: str, root: Path = ROOT) -> Comparison:
     comparison = Comparison.read(root / name)
     comparison.analysis = content_of(f"{name}/comparison.json", root)
     return comparison
+
+
+def number_of(value: Mapping[str, Any]) -> float:
+    """Look a number up in the evidence."""
+    content = content_of(value["file"])
+
+    def measured(key: str) -> float:
+        found = look_up(content, key)
+        return float(REDUCE[value["reduce"]](found) if "reduce" in value else found)
+
+    number = measured(value["key"]) * value.get("scale", 1.0)
+    return float(number / measured(value["over"]) if "over" in value else number)

@@ -1,0 +1,40 @@
+"""The table of numbers from the literature beside ours, on the nearest set-up that was measured."""
+
+from __future__ import annotations
+
+from mor_bench.report.number_format import number
+from tests.published.record import experiments
+from tests.published.run_tables import markdown
+from tests.published.stored import EvidenceError, content_of, number_of
+
+
+def literature(source: str) -> str:
+    """Show each number of a TOML file beside ours, their ratio, and the experiment behind ours.
+
+    An entry has the `family`, `what` is measured, the `published` number with its `unit` and
+    `source`, the `nearest` set-up of ours, and a number `ours` as in claims.toml. Its file belongs
+    to the `experiment` of sources.toml.
+
+    Raises
+    ------
+    EvidenceError
+        If an experiment is unknown, or does not write the file of our number.
+    """
+    body = []
+    for entry in content_of(source)["number"]:
+        name, file = entry["experiment"], entry["ours"]["file"]
+        if name not in experiments() or not file.startswith(f"reports/{name}"):
+            raise EvidenceError(f"{source}: {file} is not of an experiment {name!r}.")
+        ours = number_of(entry["ours"])
+        body.append(
+            [
+                entry["family"],
+                f"{entry['what']} ({entry['unit']})",
+                f"{number(entry['published'])}: {entry['source']}",
+                f"{number(ours)}: {entry['nearest']}",
+                number(ours / entry["published"]),
+                f"`{name}`",
+            ]
+        )
+    headings = ["family", "quantity", "published", "ours", "ours / published", "experiment"]
+    return markdown(headings, body)
