@@ -64,12 +64,12 @@ Report.table = (grid, data) => {
     layout: "fitColumns",
     columnHeaderSortMulti: false,
     columns: [
-      { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: 150, widthGrow: 3 },
+      { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: 150, widthGrow: 2 },
       { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: 126, ...numbers },
       { title: "latency (ms)", field: "latency_value", formatter: figureCell("latency"), minWidth: 112, ...numbers },
       { title: "offline (core-s)", field: "offline", formatter: figureCell("offline"), minWidth: 84, ...numbers },
       { title: "told", field: "group", formatter: textCell, minWidth: 150, widthGrow: 2 },
-      { title: "qualifies", field: "answer", formatter: textCell, sorter: natural, minWidth: 96 },
+      { title: "qualifies", field: "answer", formatter: textCell, sorter: natural, minWidth: 96, widthGrow: 2 },
     ],
     rowFormatter: (row) => {
       const { qualified, failed, status, front } = row.getData();
