@@ -210,6 +210,18 @@ def test_without_two_regions_each_sample_is_its_own_cluster() -> None:
         assert cluster_numbers(regions, 5).tolist() == [[0], [1], [2], [3], [4]]
 
 
+def test_a_load_on_the_same_region_in_every_sample_is_no_cluster() -> None:
+    pressures = np.tile(np.arange(3), (5, 1))
+    assert cluster_numbers(pressures, 5).tolist() == [[0], [1], [2], [3], [4]]
+    with_forces = np.column_stack([pressures, [9, 7, 7, 9, 8]])
+    assert cluster_numbers(with_forces, 5).tolist() == [[2], [0], [0], [2], [1]]
+    errors = np.random.default_rng(0).random(40)
+    weights = resample_weights(
+        cluster_numbers(np.tile(np.arange(3), (40, 1)), 40), 100, np.random.default_rng(1)
+    )
+    assert np.ptp(weighted_medians(errors, weights)) > 0.05
+
+
 def coverage_of_regions(effect: float, k: int, by_region: bool, n_regions: int = 13) -> float:
     """Return the share of simulated test sets whose interval contains the median over all regions.
 

@@ -121,6 +121,18 @@ def test_the_finding_above_a_distribution_is_that_of_a_drawn_curve(tmp_path: Pat
     assert "fem: 95 % of the test loads" not in text
 
 
+def test_the_details_and_the_card_say_what_a_method_is_told_and_built_for(tmp_path: Path) -> None:
+    made = tiny(tmp_path)
+    made.methods["pod"] = {"title": "POD", "regime": {"says": "large meshes", "min_dofs": 10**6}}
+    add_row(made, "pod", {}, 0.002, 1.0, told="equations", snapshots=True)
+    page = render(made)[-1].read_text(encoding="utf-8")
+    (data,) = data_of(page)
+    details = dict(dict(data["rows"][0]["details"])["Method"])
+    assert details["built for"] == "large meshes"
+    assert details["tested there"].startswith("no: not tested in its regime (")
+    assert "told: equations, snapshots" in text_of(page)
+
+
 def test_a_reference_with_a_loose_tolerance_has_errors_like_any_other(tmp_path: Path) -> None:
     made = tiny(tmp_path)
     add_row(made, "fem", {}, 0.001, 0.5, reference=True)

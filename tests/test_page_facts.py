@@ -66,7 +66,7 @@ def test_the_validation_part_and_its_interval_give_the_reason() -> None:
     sure = Entry(row, intervals={"validation_rel_l2_median": (0.002, 0.009)})
     unsure = Entry(row, intervals={"validation_rel_l2_median": (0.002, 0.0118)})
     assert answer_of(sure, NEEDS) == "no"
-    assert reason_of(unsure, NEEDS) == "no: error: upper bound 1.18 %, limit 1 %"
+    assert reason_of(unsure, NEEDS) == "no: validation error: upper bound 1.18 %, limit 1 %"
     assert answer_of(unsure, NEEDS) == "no: validation error up to 1.18 %"
 
 

@@ -15,7 +15,7 @@ from tests.published.run_tables import best_of_class
 from tests.published.stored import REPORTS, ROOT
 
 PAGE = (ROOT / "docs" / "which-method.md").read_text(encoding="utf-8")
-ROW = re.compile(r"^\| `([\w-]+)` \| \[?`([\w/-]+)`.* \| (`.*`) \|$", re.MULTILINE)
+ROW = re.compile(r"^\| `([\w-]+)` \| \[?`([\w/-]+)`.* \| (`.*`|none qualifies) \|$", re.MULTILINE)
 
 
 def stored_verdicts() -> dict[tuple[str, str], list[str]]:
@@ -31,7 +31,7 @@ def stored_verdicts() -> dict[tuple[str, str], list[str]]:
 
 
 def methods_of(verdict: dict[str, Any]) -> list[str]:
-    labels = [verdict["choice"], *verdict["undecided"]]
+    labels = [label for label in (verdict["choice"], *verdict["undecided"]) if label]
     return list(dict.fromkeys(label.partition(" ")[0] for label in labels))
 
 

@@ -24,12 +24,15 @@ def student_t(level: float, df: float) -> float:
 def cluster_numbers(regions: NDArray[np.int64] | None, n_samples: int) -> NDArray[np.int64]:
     """Number the load regions of each test sample from 0, as an (n_samples, k) array.
 
-    If fewer than two regions are known, each sample is a cluster of its own.
+    A load that acts on the same region in every sample, such as a pressure, tells nothing apart and
+    is left out. If fewer than two regions remain, each sample is a cluster of its own.
     """
-    if regions is not None and len(regions) == n_samples:
-        names, numbers = np.unique(regions, return_inverse=True)
+    if regions is not None and len(regions) == n_samples > 0:
+        columns = regions.reshape(n_samples, -1)
+        varying = columns[:, (columns != columns[0]).any(axis=0)]
+        names, numbers = np.unique(varying, return_inverse=True)
         if len(names) > 1:
-            return np.asarray(numbers.reshape(n_samples, -1))
+            return np.asarray(numbers.reshape(varying.shape))
     return np.arange(n_samples)[:, None]
 
 

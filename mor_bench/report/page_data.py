@@ -65,7 +65,7 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
         "winner": shown.card.rankings[0].picks[0].entry.label if shown.card.rankings else None,
         "styles": {entry.method: _style(entry.method) for entry in entries},
         "groups": list(by_group(entries)),
-        "rows": [_row(comparison, entry, shown.names, needs) for entry in entries],
+        "rows": [_row(shown, entry, needs) for entry in entries],
         "order": [entry.label for entry in sorted(entries, key=reading_order)],
         "distributions": distributions(found),
         "deformations": deformations(compared),
@@ -97,10 +97,9 @@ def reading_order(entry: Entry) -> tuple[bool, bool, float]:
     return not entry.qualified, bool(entry.trouble), entry.latency_ms
 
 
-def _row(
-    comparison: Comparison, entry: Entry, names: Mapping[str, str], needs: Requirements
-) -> dict[str, Any]:
+def _row(shown: Shown, entry: Entry, needs: Requirements) -> dict[str, Any]:
     """Return the figures of one configuration: errors in %, latencies in ms, cost in core-s."""
+    comparison, names = shown.comparison, shown.names
     error, latency = entry.intervals.get("rel_l2_median"), entry.intervals.get("latency_ms")
     return {
         "label": entry.label,
@@ -132,9 +131,20 @@ def _row(
         "cells": cells_of(entry),
         "hover": hover_of(entry, names),
         "details": details_of(
-            entry, method_facts(comparison, entry.method), reason_of(entry, needs)
+            entry,
+            [*method_facts(comparison, entry.method), *_untested(shown, entry.method)],
+            reason_of(entry, needs),
         ),
     }
+
+
+def _untested(shown: Shown, method: str) -> list[tuple[str, str]]:
+    """Say why the comparison does not test a method where it is built for; nothing if it does."""
+    return [
+        ("tested there", f"no: {record['verdict'].partition('. It is for: ')[0]}")
+        for record in shown.analysis["regimes"]
+        if record["method"] == method and record["in_regime"] is False
+    ]
 
 
 def cells_of(entry: Entry) -> dict[str, list[str]]:

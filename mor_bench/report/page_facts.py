@@ -28,11 +28,7 @@ def answer_of(entry: Entry, needs: Requirements) -> str:
     """Say whether a configuration qualifies, or why not: "no: validation error up to 2 %"."""
     if entry.qualified or not entry.ran:
         return "yes" if entry.qualified else entry.row.status
-    on = "validation " if entry.row.validation else ""
-    missed = [
-        f"{on if name == FIGURE_NAMES['error'] else ''}{name} up to {bound}"
-        for name, bound, _ in _missed(entry, needs)
-    ]
+    missed = [f"{name} up to {bound}" for name, bound, _ in _missed(entry, needs)]
     missed += ["loads without an answer"] if entry.n_failed else []
     return f"no: {', '.join(missed)}" if missed else "no"
 
@@ -47,7 +43,13 @@ def reason_of(entry: Entry, needs: Requirements) -> str:
 
 
 def _missed(entry: Entry, needs: Requirements) -> list[tuple[str, str, str]]:
-    return [] if entry.qualified else limits_missed(bounds_of(entry.row, entry.intervals), needs)
+    """List the limits that a configuration misses; its error is that on the validation part."""
+    if entry.qualified:
+        return []
+    error = FIGURE_NAMES["error"]
+    shown = {error: f"validation {error}"} if entry.row.validation else {}
+    missed = limits_missed(bounds_of(entry.row, entry.intervals), needs)
+    return [(shown.get(name, name), bound, limit) for name, bound, limit in missed]
 
 
 def deformation(entries: Sequence[Entry]) -> str:
