@@ -327,6 +327,7 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
     for said in (
         "processes differ by 14 %",
         "To draw them again: --test-seed 7.",
+        "Never: the full-order model is as fast. Not reached at ",
         "as large on the fresh test set as on the shipped one",
         "no graphics processor). It is for: 20,000 samples or more, on a GPU",
         "errors over 13 load regions (bootstrap of ",

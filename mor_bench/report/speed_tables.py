@@ -171,9 +171,12 @@ def break_even_table(
 ) -> TextTable | None:
     """Build the table of break-even queries and of the figures behind them."""
     by_label = {entry.label: entry for entry in entries}
-    rows = []
+    rows, absent = [], dict[float, list[str]]()
     for record in analysis["break_even"]:
-        if record["dataset"] != dataset or record["verdict"] == NOT_REACHED:
+        if record["dataset"] != dataset:
+            continue
+        if record["verdict"] == NOT_REACHED:
+            absent.setdefault(record["target_rel_l2_median"], []).append(record["method"])
             continue
         entry = by_label[record["label"]]
         paid = record["queries"] is not None
@@ -204,8 +207,10 @@ def break_even_table(
         "With tuning: all fits of the method count, failed ones too. "
         "The saving is against the fastest full-order configuration that is at least as accurate "
         "by the same rule. "
-        "Never: the full-order model is as fast. Errors that a method does not reach are left out."
+        "Never: the full-order model is as fast."
     )
+    for target, methods in absent.items():
+        note += f" Not reached at {percent(target)} %: {', '.join(methods)}."
     return TextTable("Whole cost", note, headings, rows) if rows else None
 
 
