@@ -197,7 +197,7 @@ def test_the_worst_loads_are_told_apart() -> None:
     )
     bodies = "Largest mean error e, drawn under Deformed bodies: "
     for e, said in (
-        ([1e-5, 1e-5, 1e-3], "the one with the largest in mm."),
+        ([1e-5, 1e-5, 1e-3], "the one with the largest error in mm."),
         ([1e-3, 1e-5, 1e-5], "the one with the largest relative error."),
         ([1e-5, 1e-3, 1e-5], "test load 1 (0.3 mm at a node, 0.2 %)."),
     ):

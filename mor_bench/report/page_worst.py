@@ -52,7 +52,10 @@ def worst_cases(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
     ]
     if "mean_dof_m" in arrays:
         k = int(np.argmax(arrays["mean_dof_m"]))
-        others = {i: "the one with the largest relative error", j: "the one with the largest in mm"}
+        others = {
+            i: "the one with the largest relative error",
+            j: "the one with the largest error in mm",
+        }
         figures = f"test load {k} ({_mm(nodal[k])} at a node, {percent(float(relative[k]))} %)"
         said.append(f"Largest mean error e, drawn under Deformed bodies: {others.get(k, figures)}.")
     return said
