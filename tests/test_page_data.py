@@ -23,7 +23,7 @@ from mor_bench.report.page_sections import View
 from mor_bench.report.page_verdict import method_card
 from mor_bench.report.page_worst import worst_cases
 from mor_bench.report.short_names import short_names
-from mor_bench.report.whole_cost import CostLine, Costs
+from mor_bench.report.whole_cost import CostLine, Costs, costs_of
 from mor_bench.results.comparison import Comparison
 from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
 from tests.synthetic import MESH, changed
@@ -256,6 +256,20 @@ def test_the_bars_of_the_whole_cost_show_every_part(tmp_path: Path) -> None:
     assert " at 1 % (none reaches 0.5 %), pca pays off first" in missed.finding
 
 
+@pytest.mark.parametrize(("need", "missed"), [(0.01, 1.0), (0.007, None), (0.03, None)])
+def test_a_need_is_missed_only_if_methods_were_compared_at_it(
+    tmp_path: Path, need: float, missed: float | None
+) -> None:
+    made = tiny(tmp_path)
+    made.datasets["beam-tiny"]["needs"]["error"] = need
+    add_row(made, "fem", {}, 0.001, 4.0, reference=True)
+    add_row(made, "pod", {}, 0.02, 1.0)
+    found = costs_of(made, "beam-tiny", analyse(made), entries_of(made, "beam-tiny"))
+    assert found
+    assert found.target == 3.0
+    assert found.missed == missed
+
+
 def test_the_appendix_says_how_to_measure_what_is_missing(page: str) -> None:
     text = text_of(page)
     command = r"mor-bench run beam-tiny --profile full"
@@ -274,9 +288,8 @@ def test_the_runner_up_is_one_of_another_method_with_the_same_words(tmp_path: Pa
 
     alone, both = text("alone"), text("both", "hpod")
     assert "runner-up (another method)" not in alone
-    assert (
-        alone.count("No other method that was tried qualifies.") >= 2
-    )  # on the card, and in words
+    # on the card, and in words
+    assert alone.count("No other method that was tried qualifies.") >= 2
     assert both.count("runner-up (another method) hpod") == 2  # by latency, by offline cost
     assert "Runner-up (another method): hpod, 2 ms at 0.2 %." in both
     assert "No other method that was tried qualifies." not in both

@@ -105,9 +105,7 @@ def test_stored_verdicts_are_worded_as_the_code_does(stored: Path, tmp_path: Pat
     assert list(wrong_verdicts(folder)) == []
 
 
-def test_the_table_of_literature_needs_the_experiment_of_its_number(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_table_of_literature_needs_the_experiment_of_its_number(tmp_path: Path) -> None:
     text = (REPORTS / "literature.toml").read_text()
     assert literature("reports/literature.toml").count("\n") == 1 + text.count("[[number]]")
     wrong = text.replace('experiment = "full-order/peers.json"', 'experiment = "quick-start"')

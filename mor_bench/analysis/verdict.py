@@ -109,10 +109,11 @@ class Verdict:
         Without a winner: the limits that suffice if relaxed alone.
     nearest : Row or None
         Without a winner: the configuration that exceeds the limits by the smallest factor.
-    nearest_told : dict
-        The same among those of each class of information.
     unknown : list of str
         Without a winner: requirements on a figure that no configuration has.
+    nearest_told : dict
+        By class of information: of those that answer every load, the configuration that exceeds the
+        limits by the smallest factor; None if there is none.
     n_without_answers : int
         Configurations that failed, were skipped or left a load without an answer.
     figures : dict
@@ -150,8 +151,8 @@ class Verdict:
     undecided: Sequence[Row] = ()
     relaxations: Sequence[Relaxation] = ()
     nearest: Row | None = None
-    nearest_told: Mapping[Told | None, Row | None] = field(default_factory=dict)
     unknown: Sequence[str] = ()
+    nearest_told: Mapping[Told | None, Row | None] = field(default_factory=dict)
     n_without_answers: int = 0
     figures: Figures = field(default_factory=dict)
     intervals: Mapping[str, Mapping[str, Interval]] = field(default_factory=dict)

@@ -61,7 +61,7 @@ class CostLine:
 class Costs:
     """The costs at a target error in %; the full-order model, if known, is the first line.
 
-    `missed` is the required error in %, where only the full-order model reaches it.
+    `missed` is the required error in % if the methods were compared at it and none reaches it.
     """
 
     target: float
@@ -109,7 +109,8 @@ def costs_of(
     comparison: Comparison, dataset: str, analysis: Analysis, entries: Sequence[Entry]
 ) -> Costs | None:
     """Return the costs of the methods that reach the required error; None if none does."""
-    records = [r for r in analysis["break_even"] if r["dataset"] == dataset and r["label"]]
+    compared = [r for r in analysis["break_even"] if r["dataset"] == dataset]
+    records = [record for record in compared if record["label"]]
     needed = needs_of(comparison, dataset).error
     targets = {record["target_rel_l2_median"] for record in records}
     if not targets:
@@ -125,7 +126,8 @@ def costs_of(
         for label, n in queries.items()
         if label in by_label and (line := _line(by_label[label], str(names[label]), n))
     ]
-    missed = 100 * needed if needed and needed < target else None
+    known = needed in {record["target_rel_l2_median"] for record in compared}
+    missed = 100 * needed if known and needed and needed not in targets else None
     return Costs(100 * target, full_order, lines, missed) if lines else None
 
 

@@ -80,7 +80,7 @@ _NOT_PROSE = (
 )
 
 
-IN_WORDS = {2: "two", 3: "three", 5: "five", 10: "ten"}
+IN_WORDS: dict[float, str] = {2: "two", 3: "three", 5: "five", 10: "ten"}
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def formatted(value: Mapping[str, Any]) -> str:
     """Look a number up in the evidence and format it for its sentence."""
     number = number_of(value)
     if value.get("format") == "word":
-        return IN_WORDS[round(number)]
+        return IN_WORDS[number]
     return re.sub(r"e([-+])0?", r"e\1", format(number, value.get("format", ",g"))).replace(
         "e+", "e"
     )

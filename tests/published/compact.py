@@ -172,9 +172,9 @@ PARTS = {"validation": "validation_relative_l2", "hidden": "hidden_relative_l2"}
 
 
 def reword(folder: Path) -> bool:
-    """Word the stored verdicts as the code does now; numbers stay. Return whether a text changed.
+    """Word headlines, and what is beside them, as the code does now; return whether a text changed.
 
-    What does not follow from rows and intervals alone is kept as it is stored.
+    Numbers stay. What does not follow from rows and intervals alone is kept as it is stored.
     """
     comparison, path = Comparison.read(folder), folder / "comparison.json"
     analysis = json.loads(path.read_text(encoding="utf-8"))

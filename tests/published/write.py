@@ -12,6 +12,7 @@ from tests.published.blocks import pages, with_blocks
 from tests.published.claims import statements, with_numbers, without_evidence, wrong_numbers
 from tests.published.compact import reword
 from tests.published.pictures import draw_pictures
+from tests.published.record import experiments
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of
 
 
@@ -19,9 +20,9 @@ def main() -> int:
     """Write every page; print what remains to be done by hand, and return 1 if there is any."""
     known = statements()
     left = []
-    for run in sorted(REPORTS.rglob("comparison.json")):
-        if reword(run.parent):
-            print(f"{run.relative_to(ROOT).as_posix()}: worded as the code does now")
+    for name in experiments():
+        if (REPORTS / name / "comparison.json").is_file() and reword(REPORTS / name):
+            print(f"reports/{name}: its verdicts are worded as the code does now")
             content_of.cache_clear()
     for path in pages():
         page = path.relative_to(ROOT).as_posix()
