@@ -21,7 +21,7 @@ from mor_bench.report.figures import write_figures
 from mor_bench.report.hard_case_table import stress_table
 from mor_bench.report.method_view import method_view
 from mor_bench.report.number_format import unbroken, whole
-from mor_bench.report.page_facts import machine_facts, method_facts
+from mor_bench.report.page_facts import AGAIN, machine_facts, method_facts
 from mor_bench.report.page_index import standings
 from mor_bench.report.page_scripts import Assets, beside, embedded_json, inlined
 from mor_bench.report.page_sections import View, section_of
@@ -180,6 +180,7 @@ def _write(path: Path, view: View, frame: Frame) -> Path:
             n_resamples=whole(view.analysis["settings"]["n_resamples"]),
             told={told or "": told_text(told, observed) for told in classes_of(comparison.rows)},
             legend=LEGEND,
+            AGAIN=AGAIN,
             data=embedded_json([section.data for section in sections]),
         )
     )

@@ -16,8 +16,8 @@ from mor_bench.report.cards import pair_text
 from mor_bench.report.entries import Analysis, Entry, verdict_of
 from mor_bench.report.method_styles import style_of
 from mor_bench.report.not_measured import beyond_training
-from mor_bench.report.number_format import bytes_text, number
-from mor_bench.report.page_samples import dataset_arrays
+from mor_bench.report.number_format import bytes_text, number, percent
+from mor_bench.report.page_samples import Sampled, dataset_arrays
 from mor_bench.report.scene_text import recorded_scene
 from mor_bench.report.short_names import renamed, short_names
 from mor_bench.report.summary import discretisation_error, needs_in_words
@@ -52,11 +52,24 @@ def _missed(entry: Entry, needs: Requirements) -> list[tuple[str, str, str]]:
     return [(shown.get(name, name), bound, limit) for name, bound, limit in missed]
 
 
-def deformation(entries: Sequence[Entry]) -> str:
-    """State the largest displacement of the test loads; empty if it is unknown."""
+def deformation(entries: Sequence[Entry], found: Sequence[Sampled] = ()) -> str:
+    """State how far the test loads move the body, and how nonlinear that is; empty if unknown."""
     known = (entry.figure("error", "amplitude_m") for entry in entries)
     largest = next((value for value in known if value), None)
-    return f"Largest displacement of the test loads: {number(largest)} m." if largest else ""
+    if not largest:
+        return ""
+    moved = next((i.arrays["amplitude_m"] for i in found if "amplitude_m" in i.arrays), None)
+    middle = "" if moved is None else f"{number(float(np.nanmedian(moved)))} m (median), "
+    said = (
+        f"Largest displacement of a node in the test loads: {middle}{number(largest)} m (largest)."
+    )
+    linear = next((e for e in entries if e.method == "linear-fem" and e.ran), None)
+    if linear is not None:
+        error = percent(linear.error)
+        said += (
+            f" The linear model has an error of {error} % (median): so nonlinear are the answers."
+        )
+    return said
 
 
 _UNSEEN = {
@@ -159,6 +172,10 @@ def method_facts(comparison: Comparison, method: str) -> list[tuple[str, str]]:
     return [(name, str(text).strip()) for name, text in facts.items() if text]
 
 
+AGAIN = "command that runs it all again"
+"""Name of the fact that repeats a run."""
+
+
 def facts_of(
     comparison: Comparison, dataset: str, entries: Sequence[Entry]
 ) -> list[tuple[str, str]]:
@@ -186,7 +203,7 @@ def facts_of(
         asked = {**asked, "test_seed": seed}
     command = run_command(asked) if comparison.settings else ""
     return [
-        *([("command that runs it all again", command)] if command else []),
+        *([(AGAIN, command)] if command else []),
         *facts,
         ("split", split),
         (
@@ -254,7 +271,9 @@ def _refinement(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
     orders = [load["order"] for load in loads if load.get("order") is not None]
     n = sum(load.get("limit") == "extrapolated" for load in loads)
     meshes = ", ".join(f"{mesh['n_dofs']:,}" for mesh in record["meshes"])
+    errors = [load["relative_l2"] for load in loads if load.get("relative_l2") is not None]
     text = f"{len(loads)} loads on meshes with {meshes} degrees of freedom"
+    text += f"; errors from {percent(min(errors))} % to {percent(max(errors))} %" if errors else ""
     text += f"; median order {number(float(np.median(orders)))}" if orders else ""
     text += f"; limit by Richardson extrapolation for {n} loads, else the finest mesh"
     return [("how it was measured", text)]

@@ -37,10 +37,10 @@ def frontier(data: Data, title: str) -> Chart:
         "Left and down is better. Lines join the configurations of a method. Bars are 95 % "
         "intervals, for medians only. Open markers: the timing was not stable. A label with a "
         "value belongs to a marker beyond the axis, drawn at its edge. On a phone, the list below "
-        "names the numbers. The dashed steps "
-        "are the Pareto front. References solve the full equations on the dataset's own mesh. "
-        "Click on the legend to hide a method, double-click to isolate it. By keyboard: Tab to the "
-        "legend, arrow keys to an entry, then Enter or Shift+Enter."
+        "names the numbers. The dashed steps are the Pareto front; they also run through "
+        "references, which get no mark in the tables. References solve the full equations on "
+        "the dataset's own mesh. Click on the legend to hide a method, double-click to isolate "
+        "it. By keyboard: Tab to the legend, arrow keys to an entry, then Enter or Shift+Enter."
     )
     return Chart("frontier", "Error against time", title, reading)
 
@@ -145,8 +145,8 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         "Error against deformation",
         "deformations",
         _deformation,
-        "Lines: medians of e (mean absolute error over all degrees of freedom, those of the "
-        "supports too) in ten groups of test loads, by the largest displacement of the reference. "
+        "Lines: medians in ten groups of test loads, by the largest displacement of the reference. "
+        "e: mean absolute error over all degrees of freedom, those of the supports too. "
         "Dots: the test loads of one method.",
     ),
     "distributions": (

@@ -109,21 +109,25 @@ def distributions(found: Sequence[Sampled]) -> list[dict[str, Any]]:
 
 
 def deformations(found: Sequence[Sampled]) -> list[dict[str, Any]]:
-    """Return dots (mm, mm) and medians of ten equal groups of the error e over the deformation."""
+    """Return dots and medians of ten equal groups of the error over the deformation (mm).
+
+    The error is e (mm) in `y`, and the relative L2 error (%) in `share`, of the same test loads.
+    """
     out = []
     for item in found:
-        if not {"amplitude_m", "mean_dof_m"} <= set(item.arrays):
+        if not {"amplitude_m", "mean_dof_m", "relative_l2"} <= set(item.arrays):
             continue
         x = 1e3 * np.asarray(item.arrays["amplitude_m"], dtype=float)
         y = 1e3 * np.asarray(item.arrays["mean_dof_m"], dtype=float)
-        known = np.isfinite(x) & np.isfinite(y)
-        x, y = x[known], y[known]
+        share = 100 * np.asarray(item.arrays["relative_l2"], dtype=float)
+        known = np.isfinite(x) & np.isfinite(y) & np.isfinite(share)
+        x, y, share = x[known], y[known], share[known]
         if not len(x):
             continue
         order = np.argsort(x)
         groups = np.array_split(order, min(N_BINS, len(order)))
         # The largest errors are kept, because they are what a reader looks for.
-        largest = np.argsort(y)[-20:]
+        largest = np.concatenate([np.argsort(y)[-20:], np.argsort(share)[-20:]])
         even = order[np.linspace(0, len(order) - 1, min(MOST_DOTS, len(order))).astype(int)]
         dots = np.unique(np.concatenate([largest, even]))
         out.append(
@@ -131,10 +135,12 @@ def deformations(found: Sequence[Sampled]) -> list[dict[str, Any]]:
                 "label": item.entry.label,
                 "x": rounded(x[dots]),
                 "y": rounded(y[dots]),
+                "share": rounded(share[dots]),
                 "n": len(known),
                 "n_missing": int((~known).sum()),
                 "median_x": rounded([np.median(x[g]) for g in groups]),
                 "median_y": rounded([np.median(y[g]) for g in groups]),
+                "median_share": rounded([np.median(share[g]) for g in groups]),
             }
         )
     return out

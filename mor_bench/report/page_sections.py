@@ -138,7 +138,9 @@ def section_of(view: View, dataset: str) -> Section:
     return Section(
         name=dataset,
         title=str(comparison.datasets.get(dataset, {}).get("title") or ""),
-        scene=" ".join([scene_text(comparison.datasets.get(dataset, {})), deformation(entries)]),
+        scene=" ".join(
+            [scene_text(comparison.datasets.get(dataset, {})), deformation(entries, samples)]
+        ),
         limits=limits_of(comparison, analysis, entries),
         card=verdict,
         given="observed displacements" if is_observed(comparison, dataset) else "nodal forces (N)",
@@ -212,7 +214,8 @@ def _frontier_title(verdict: Card) -> str:
     if not verdict.rankings:
         return "No configuration meets both needs"
     first = verdict.rankings[0].picks[0]
-    return f"{first.name} answers in {first.latency} ms with an error of {first.error} %"
+    answer = f"{first.name} answers in {first.latency} ms with an error of {first.error} %"
+    return f"{first.part.capitalize()}: {answer}"
 
 
 def _complete(

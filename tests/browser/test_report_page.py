@@ -215,8 +215,11 @@ def test_findings_follow_what_is_chosen(open_page: Visit) -> None:
     figure.scroll_into_view_if_needed()
     line = data["deformations"][-1]
     name = next(row["name"] for row in data["rows"] if row["label"] == line["label"])
-    figure.locator("select").select_option(line["label"])
-    assert figure.locator(".finding").inner_text().startswith(f"{name}: ")
+    figure.locator("select").nth(0).select_option(line["label"])
+    assert figure.locator(".finding").inner_text().startswith(f"{name}: the median error e is ")
+    figure.locator("select").nth(1).select_option("%")
+    said = f"{name}: the median relative L2 error is {percent(line['median_share'][0] / 100)} %"
+    assert joined_units(said) in joined_units(figure.locator(".finding").inner_text())
 
 
 def test_a_heading_sorts_by_mouse_and_by_keyboard(open_page: Visit) -> None:

@@ -113,6 +113,12 @@ def outliving(folder: Path) -> list[str]:
     return found
 
 
+def heed_signals() -> None:
+    """Let the commands heed the signals: `nohup` or a shell may have told this process not to."""
+    for name in SIGNALS[1:]:
+        signal.signal(signal.Signals[name], signal.SIG_DFL)
+
+
 def start(command: str, folder: Path) -> subprocess.Popen[bytes]:
     (folder / "tmp").mkdir(parents=True, exist_ok=True)
     environment = {
@@ -193,8 +199,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file to write the outcomes to")
     given = parser.parse_args()
     wrong, rows = 0, []
-    for name in SIGNALS[1:]:  # a shell or `nohup` may have told its children to ignore them
-        signal.signal(signal.Signals[name], signal.SIG_DFL)
+    heed_signals()
     with tempfile.TemporaryDirectory() as parent:
         for command in given.commands:
             undisturbed(command, Path(parent) / f"{command}-first")  # compiles the kernels

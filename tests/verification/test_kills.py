@@ -9,7 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.verification.kills import COMMANDS, SIGNALS, Undisturbed, kill_often, undisturbed
+from tests.verification.kills import (
+    COMMANDS,
+    SIGNALS,
+    Undisturbed,
+    heed_signals,
+    kill_often,
+    undisturbed,
+)
 
 
 @pytest.fixture(scope="module", params=COMMANDS)
@@ -25,6 +32,7 @@ def expected(
 def test_a_killed_command_leaves_nothing_and_ends_with_the_same_result(
     expected: Undisturbed, name: str, tmp_path: Path
 ) -> None:
+    heed_signals()
     found = kill_often(expected, signal.Signals[name], 2, tmp_path, int(time.time()))
     assert found.kills == 2
     assert not found.wrong

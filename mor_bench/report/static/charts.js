@@ -60,29 +60,33 @@ Report.kinds.deformations = (figure, data) => {
   const R = Report;
   const plot = figure.querySelector(".plot");
   const dots = R.choice(figure, "dots of", R.options(data, data.deformations), () => show());
+  const kind = R.choice(figure, "error", [["mm", "e (mm)"], ["%", "relative L2 error (%)"]], () => show());
   function show() {
+    const unit = kind.value, named = unit === "mm" ? "error e" : "relative L2 error";
+    const dotsOf = (l) => (unit === "mm" ? l.y : l.share);
+    const mediansOf = (l) => (unit === "mm" ? l.median_y : l.median_share);
     const traces = data.deformations.map((line) => ({
       type: "scatter", mode: "lines+markers", name: R.plain(R.nameOf(data, line.label)),
-      x: line.median_x, y: line.median_y,
+      x: line.median_x, y: mediansOf(line),
       line: { color: R.colour(data, line.label), width: 1.5 },
       marker: { symbol: R.symbol(data, line.label), size: 7, color: R.colour(data, line.label) },
-      hovertemplate: "median e %{y:.3~g} mm at %{x:.3~g} mm",
+      hovertemplate: `median ${named} %{y:.3~g} ${unit} at %{x:.3~g} mm`,
     }));
     const line = data.deformations.find((l) => l.label === dots.value);
-    const [least, most] = [line.median_y[0], line.median_y.at(-1)].map(R.short);
-    R.say(figure, `${R.nameOf(data, line.label)}: the median error e is ${least} mm at the smallest ` +
-      `deformations and ${most} mm at the largest`);
+    const [least, most] = [mediansOf(line)[0], mediansOf(line).at(-1)].map(R.short);
+    R.say(figure, `${R.nameOf(data, line.label)}: the median ${named} is ${least} ${unit} at the smallest ` +
+      `deformations and ${most} ${unit} at the largest`);
     traces.unshift({
-      type: "scatter", mode: "markers", name: "test loads", x: line.x, y: line.y, showlegend: false,
+      type: "scatter", mode: "markers", name: "test loads", x: line.x, y: dotsOf(line), showlegend: false,
       marker: { color: R.colour(data, line.label), size: 5, opacity: 0.35 },
-      hovertemplate: "e %{y:.3~g} mm at %{x:.3~g} mm<extra></extra>",
+      hovertemplate: `${named} %{y:.3~g} ${unit} at %{x:.3~g} mm<extra></extra>`,
     });
-    const medians = data.deformations.flatMap((l) => l.median_y).filter((v) => v > 0);
-    const top = Math.max(...medians, ...line.y);
+    const medians = data.deformations.flatMap(mediansOf).filter((v) => v > 0);
+    const top = Math.max(...medians, ...dotsOf(line));
     const range = [Math.log10(Math.min(...medians)) - 0.5, Math.log10(top) + 0.2];
     return R.draw(plot, traces, R.layout({
       xaxis: R.axis("largest displacement (mm)"),
-      yaxis: R.logAxis("error e (mm)", { range }), ...R.legend(traces.length, 420),
+      yaxis: R.logAxis(`${named} (${unit})`, { range }), ...R.legend(traces.length, 420),
     }));
   }
   return show;

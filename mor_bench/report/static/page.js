@@ -44,12 +44,15 @@
     again();
   });
 
-  // A link into a folded part opens it.
-  const unfold = () => {
+  // A link into a folded part opens it. Charts above it take their room first, or it would move away.
+  const unfold = async () => {
     const part = document.getElementById(window.location.hash.slice(1));
-    const folded = part?.closest("details");
-    if (!folded) return;
-    folded.open = true;
+    if (!part) return;
+    const folded = part.closest("details");
+    if (folded) folded.open = true;
+    const above = charts.filter(({ figure, shown }) =>
+      !shown && figure.compareDocumentPosition(part) & Node.DOCUMENT_POSITION_FOLLOWING);
+    await Promise.all(above.map(show));
     part.scrollIntoView();
   };
   window.addEventListener("hashchange", unfold);
