@@ -18,7 +18,7 @@ import numpy as np
 from mor_bench.errors import MorBenchError
 
 QUICK, SLOW = 200, 2000
-"""Mutations of each reader's files in the quick and in the slow part of the tests."""
+"""Mutations of each reader's files in the quick and in the nightly tests."""
 
 LIMIT_S, WAIT_S, LIMIT_BYTES = 2.0, 60.0, 500_000_000
 """Limits for one mutated file: processor time, time on the clock, and memory."""

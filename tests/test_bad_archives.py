@@ -242,7 +242,7 @@ def test_the_finders_files_are_ignored_and_never_opened(
         import_archive(archive_copy, cache)
 
 
-@pytest.mark.parametrize("n", [40, pytest.param(400, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [40, pytest.param(400, marks=pytest.mark.nightly)])
 def test_mutated_archives_are_read_or_refused(n: int, sound_archive: Path, tmp_path: Path) -> None:
     folder, cache = tmp_path / "archive", tmp_path / "cache"
     shutil.copytree(sound_archive, folder)

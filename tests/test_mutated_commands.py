@@ -68,7 +68,7 @@ def test_commands_on_mutated_files_end_well(name: str, tmp_path: Path) -> None:
     attacked(reader_of(name), tmp_path, OF_COMMANDS[name][0])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", OF_COMMANDS)
 def test_commands_on_many_mutated_files_end_well(name: str, tmp_path: Path) -> None:
     attacked(reader_of(name), tmp_path, OF_COMMANDS[name][1])

@@ -376,7 +376,7 @@ def test_mutated_files_are_read_or_refused(reader: Reader, tmp_path: Path) -> No
     attacked(reader, tmp_path, QUICK)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 def test_many_mutated_files_are_read_or_refused(reader: Reader, tmp_path: Path) -> None:
     attacked(reader, tmp_path, SLOW)

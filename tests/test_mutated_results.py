@@ -46,6 +46,11 @@ from tests.mutations import (
 DRAWING_S, DRAWN = 60.0, 40
 """Processor time for all figures of a report, and number of reports that are drawn."""
 
+DRAWINGS = [
+    pytest.param(DRAWN // 10, marks=pytest.mark.slow),
+    pytest.param(DRAWN, marks=pytest.mark.nightly),
+]
+
 
 def concluded(path: Path) -> None:
     """Read a run, draw its conclusions, print its tables and pick from it."""
@@ -165,18 +170,18 @@ def test_mutated_results_are_read_or_refused(reader: Reader, tmp_path: Path) -> 
     attacked(reader, tmp_path, QUICK)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 def test_many_mutated_results_are_read_or_refused(reader: Reader, tmp_path: Path) -> None:
     attacked(reader, tmp_path, SLOW)
 
 
-@pytest.mark.parametrize("n", [CONCLUDED // 25, pytest.param(CONCLUDED, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [CONCLUDED // 25, pytest.param(CONCLUDED, marks=pytest.mark.nightly)])
 def test_mutated_results_are_concluded_on_or_refused(n: int, tmp_path: Path) -> None:
     attacked(Reader("results.json", a_run, concluded, JSON), tmp_path, n)
 
 
-@pytest.mark.parametrize("n", [CONCLUDED // 25, pytest.param(CONCLUDED, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [CONCLUDED // 25, pytest.param(CONCLUDED, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("of_dataset", [False, True], ids=["row", "dataset"])
 def test_forged_arrays_are_concluded_on_or_refused(
     of_dataset: bool, n: int, tmp_path: Path
@@ -185,11 +190,11 @@ def test_forged_arrays_are_concluded_on_or_refused(
     attacked(Reader("samples.h5", write, read, [forged_arrays]), tmp_path, n)
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("n", DRAWINGS)
 @pytest.mark.parametrize("of_dataset", [False, True], ids=["row", "dataset"])
-def test_forged_arrays_are_drawn_or_refused(of_dataset: bool, tmp_path: Path) -> None:
+def test_forged_arrays_are_drawn_or_refused(of_dataset: bool, n: int, tmp_path: Path) -> None:
     write, read = a_dataset if of_dataset else a_sample, in_a_run(drawn, of_dataset)
-    attacked(Reader("samples.h5", write, read, [forged_arrays], DRAWING_S), tmp_path, DRAWN)
+    attacked(Reader("samples.h5", write, read, [forged_arrays], DRAWING_S), tmp_path, n)
 
 
 @pytest.mark.parametrize(
@@ -211,9 +216,9 @@ def test_results_that_would_fill_the_memory_are_refused(
         Comparison.read(tmp_path)
 
 
-@pytest.mark.slow
-def test_mutated_results_are_drawn_or_refused(tmp_path: Path) -> None:
-    attacked(Reader("results.json", a_run, drawn, JSON, DRAWING_S), tmp_path, DRAWN)
+@pytest.mark.parametrize("n", DRAWINGS)
+def test_mutated_results_are_drawn_or_refused(n: int, tmp_path: Path) -> None:
+    attacked(Reader("results.json", a_run, drawn, JSON, DRAWING_S), tmp_path, n)
 
 
 def test_without_raw_samples_nothing_is_picked_or_reported(tmp_path: Path) -> None:
@@ -278,7 +283,7 @@ def model_reader(model: Path, read: Callable[[Path], object]) -> Reader:
     return Reader("model.safetensors", write, read, [mutated_bytes, forged_model])
 
 
-@pytest.mark.parametrize("n", [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [QUICK, pytest.param(SLOW, marks=pytest.mark.nightly)])
 def test_mutated_models_are_read_or_refused(
     model: Path, tiny_scene: Scene, tmp_path: Path, n: int
 ) -> None:
@@ -286,7 +291,7 @@ def test_mutated_models_are_read_or_refused(
     attacked(model_reader(model, read), tmp_path, n)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_mutated_models_with_their_scenes_are_read_or_refused(model: Path, tmp_path: Path) -> None:
     attacked(model_reader(model, mor_bench.load_surrogate), tmp_path, SLOW)
 

@@ -26,7 +26,7 @@ def expected(
     return undisturbed(request.param, tmp_path_factory.mktemp("undisturbed"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 @pytest.mark.parametrize("name", SIGNALS)
 def test_a_killed_command_leaves_nothing_and_ends_with_the_same_result(
