@@ -1,7 +1,8 @@
 """Every option of a run and of a single fit, declared once with its range, default and description.
 
-`mor_bench.run`, `mor_bench.fit`, the dry run, the check of a resumed run and the command line all
-read these models. A bad value or an unknown name raises one clear `InvalidInputError`.
+`mor_bench.run`, `mor_bench.fit`, the dry run and the command line all read these models. An option
+that changes results also stands in `RunContext.recorded`, which a resumed run compares. A bad value
+or an unknown name raises one clear `InvalidInputError`.
 
 >>> RunOptions(seeds=0)
 Traceback (most recent call last):

@@ -11,7 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from mor_bench.analysis.analyse import analyse
 from mor_bench.measure.error_metrics import summary
+from mor_bench.report.entries import Analysis
+from mor_bench.report.page import write_page
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from mor_bench.specs import load_dataset_spec
@@ -52,6 +55,12 @@ def tiny(out: Path, *names: str, **machine: Any) -> Comparison:
     for name in names or ("beam-tiny",):
         made.add_dataset(name, load_dataset_spec("beam-tiny").model_dump(mode="json"), arrays)
     return made
+
+
+def page_of(comparison: Comparison, analysis: Analysis | None = None) -> str:
+    """Return the page of a comparison; no figures are drawn, which would take most of the time."""
+    analysis = analysis or analyse(comparison)
+    return write_page(comparison, analysis)[-1].read_text(encoding="utf-8")
 
 
 def markup_of(page: str) -> str:

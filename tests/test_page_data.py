@@ -17,7 +17,7 @@ import pytest
 from mor_bench.analysis.analyse import analyse
 from mor_bench.report.entries import entries_of, verdict_of
 from mor_bench.report.number_format import joined_units, number, percent, unbroken
-from mor_bench.report.page import render
+from mor_bench.report.page import write_page
 from mor_bench.report.page_index import standings
 from mor_bench.report.page_sections import View
 from mor_bench.report.page_verdict import method_card
@@ -25,7 +25,7 @@ from mor_bench.report.page_worst import worst_cases
 from mor_bench.report.short_names import short_names
 from mor_bench.report.whole_cost import CostLine, Costs, costs_of
 from mor_bench.results.comparison import Comparison
-from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
+from tests.report_runs import N_TEST, add_row, data_of, markup_of, page_of, text_of, tiny
 from tests.synthetic import MESH, changed
 
 
@@ -41,7 +41,7 @@ def comparison(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
 
 @pytest.fixture(scope="module")
 def page(comparison: Comparison) -> str:
-    return render(comparison)[-1].read_text(encoding="utf-8")
+    return page_of(comparison)
 
 
 def test_the_data_of_the_charts_are_those_of_the_rows(comparison: Comparison, page: str) -> None:
@@ -84,10 +84,10 @@ def test_a_body_keeps_its_shape_and_its_error(comparison: Comparison, page: str)
 def test_pages_of_an_earlier_report_do_not_stay_old(tmp_path: Path) -> None:
     made = tiny(tmp_path)
     add_row(made, "pod", {}, 0.005, 1.0)
-    render(made, pages=True)
+    write_page(made, analyse(made), pages=True)
     (old,) = (tmp_path / "pages").glob("*pod*.html")
     old.write_text("old")
-    render(made)
+    write_page(made, analyse(made))
     assert old.read_text() != "old"
 
 
@@ -116,7 +116,7 @@ def test_the_finding_above_a_distribution_is_that_of_a_drawn_curve(tmp_path: Pat
     made = tiny(tmp_path)
     add_row(made, "fem", {}, 1e-9, 0.5, reference=True)
     add_row(made, "pod", {}, 0.02, 1.0)
-    text = text_of(render(made)[-1].read_text(encoding="utf-8"))
+    text = text_of(page_of(made))
     assert "pod: 95 % of the test loads" in text
     assert "fem: 95 % of the test loads" not in text
 
@@ -125,7 +125,7 @@ def test_the_details_and_the_card_say_what_a_method_is_told_and_built_for(tmp_pa
     made = tiny(tmp_path)
     made.methods["pod"] = {"title": "POD", "regime": {"says": "large meshes", "min_dofs": 10**6}}
     add_row(made, "pod", {}, 0.002, 1.0, told="equations", snapshots=True)
-    page = render(made)[-1].read_text(encoding="utf-8")
+    page = page_of(made)
     (data,) = data_of(page)
     details = dict(dict(data["rows"][0]["details"])["Method"])
     assert details["built for"] == "large meshes"
@@ -137,7 +137,7 @@ def test_a_reference_with_a_loose_tolerance_has_errors_like_any_other(tmp_path: 
     made = tiny(tmp_path)
     add_row(made, "fem", {}, 0.001, 0.5, reference=True)
     add_row(made, "pod", {}, 0.02, 1.0)
-    page = render(made)[-1].read_text(encoding="utf-8")
+    page = page_of(made)
     assert "fem: 95 % of the test loads" in text_of(page)
     (data,) = data_of(page)
     assert [line["label"] for line in data["deformations"]] == ["fem", "pod"]
@@ -147,7 +147,7 @@ def test_the_speed_up_over_a_full_order_model_that_is_too_slow_is_stated(tmp_pat
     made = tiny(tmp_path)
     add_row(made, "fem", {}, 0.001, 40.0, reference=True)
     add_row(made, "pod", {}, 0.002, 1.0)
-    text = text_of(render(made)[-1].read_text(encoding="utf-8"))
+    text = text_of(page_of(made))
     assert "It is 40 times as fast as the full-order model (fem)." in text
 
 
@@ -157,7 +157,7 @@ def test_many_unstable_timings_become_one_line(tmp_path: Path) -> None:
         row = add_row(made, "pod", {"n_modes": i + 1}, 0.005, 1.0 + i)
         doubt = {"stable": False, "unstable_because": [f"processes differ by {10 + i} %"]}
         made.put(changed(row, latency_ms=doubt))
-    page = render(made, analyse(made, n_resamples=50))[-1].read_text(encoding="utf-8")
+    page = page_of(made, analyse(made, n_resamples=50))
     outside = re.sub(r"<details>.*?</details>", "", markup_of(page), flags=re.DOTALL)
     text = text_of(outside)
     assert text.count("5 of 5 timings were not stable") == 1
@@ -284,7 +284,7 @@ def test_the_runner_up_is_one_of_another_method_with_the_same_words(tmp_path: Pa
             add_row(made, "pod", {"n_modes": rank}, 0.002, latency)
         for name in others:
             add_row(made, name, {}, 0.002, 2.0)
-        return text_of(render(made, analyse(made, n_resamples=50))[-1].read_text("utf-8"))
+        return text_of(page_of(made, analyse(made, n_resamples=50)))
 
     alone, both = text("alone"), text("both", "hpod")
     assert "runner-up hpod" not in alone

@@ -26,7 +26,7 @@ from mor_bench.report.speed_tables import NOT_REACHED, pairs_at, target_table
 from mor_bench.report.summary import discretisation_error, warnings_of
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import ErrorSummary
-from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
+from tests.report_runs import N_TEST, add_row, data_of, markup_of, page_of, text_of, tiny
 from tests.synthetic import (
     a_row,
     synthetic_comparison,
@@ -222,12 +222,12 @@ def test_the_discretisation_error_is_shown_with_its_evidence() -> None:
 
 
 def test_a_report_without_a_completed_row_says_so(tmp_path: Path) -> None:
-    nothing = render(Comparison(tmp_path / "nothing", {}))[-1].read_text(encoding="utf-8")
+    nothing = page_of(Comparison(tmp_path / "nothing", {}))
     assert "nothing to report" in nothing
     made = tiny(tmp_path, "beam-tiny", "other")
     made.put(a_row("pod", status="failed", reason="no memory"))
     made.put(a_row("pod", dataset="other", status="skipped", reason="not supported"))
-    page = render(made)[-1].read_text(encoding="utf-8")
+    page = page_of(made)
     assert page.count('<p class="verdict">No configuration gave a usable result') == 2
     for text in (page, console_text(made)):
         assert "no memory" in text
@@ -279,7 +279,7 @@ def test_a_warning_of_many_configurations_is_shown_once() -> None:
 
 @pytest.mark.slow
 def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis: Analysis) -> None:
-    page = render(rich, analysis)[-1].read_text(encoding="utf-8")
+    page = page_of(rich, analysis)
     titles = re.findall("<h3>(.*?)</h3>", page)
     assert titles == [
         "Error against time",
@@ -348,7 +348,7 @@ OTHER_NAMES = re.compile(r"\brel(?:\.|ative)? ?l2\b", re.IGNORECASE)
 def test_the_error_has_one_name_on_page_terminal_and_pictures(
     rich: Comparison, analysis: Analysis
 ) -> None:
-    page = render(rich, analysis)[-1].read_text(encoding="utf-8")
+    page = page_of(rich, analysis)
     texts = {"page": text_of(page), "data": json.dumps(data_of(page))}
     texts["terminal"] = " ".join(console_text(rich, analysis=analysis).split())
     for picture in pictures_of(rich, "beam-coarse", analysis):

@@ -14,13 +14,12 @@ from rich.console import Console
 from mor_bench.analysis.told import told_at_most
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.entries import by_group, entries_of
-from mor_bench.report.page import render
 from mor_bench.report.text_table import TextTable, with_information
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from mor_bench.specs import load_dataset_spec
 from tests.commands import invoke
-from tests.report_runs import add_row, tiny
+from tests.report_runs import add_row, page_of, tiny
 from tests.synthetic import a_row
 
 
@@ -74,7 +73,7 @@ def test_rows_are_grouped_by_what_their_methods_are_told(made: Comparison) -> No
 
 
 def test_the_page_filters_rows_without_a_script(made: Comparison) -> None:
-    page = render(made)[-1].read_text(encoding="utf-8")
+    page = page_of(made)
     assert 'tr[data-told="input"] { display: none; }' in page
     markup = page.split("<script", 1)[0]
     assert markup.count('type="checkbox"') == 3
@@ -82,7 +81,7 @@ def test_the_page_filters_rows_without_a_script(made: Comparison) -> None:
     assert table.count('data-told="input"') == 3
     assert "checked> force only</label>" in page
     made.datasets["beam-tiny"]["observed"] = {"region": "x-max"}
-    page = render(made)[-1].read_text(encoding="utf-8")
+    page = page_of(made)
     assert "checked> observed displacements only</label>" in page
 
 

@@ -53,7 +53,9 @@ def vtu(
         int, typer.Option(min=0, help="Number of the sample in its part, counted from 0.")
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write to.")],
-    part: Annotated[str, typer.Option(help="train, test, or the name of a test set.")] = "test",
+    part: Annotated[
+        str, typer.Option(help="train, validation, test, or the name of a test set.")
+    ] = "test",
     model: Annotated[
         list[Path] | None,
         typer.Option("--model", metavar="FILE", help="Fitted model; repeat for more."),
@@ -88,7 +90,9 @@ def pvd(
         Path,
         typer.Option(metavar="FILE", help="PVD file to write. VTU files are written beside it."),
     ],
-    part: Annotated[str, typer.Option(help="train, test, or the name of a test set.")] = "test",
+    part: Annotated[
+        str, typer.Option(help="train, validation, test, or the name of a test set.")
+    ] = "test",
     steps: Annotated[
         int | None,
         typer.Option(min=1, help="Steps of the load path of one test sample, from rest."),

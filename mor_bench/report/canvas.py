@@ -234,6 +234,7 @@ def save(picture: Picture, comparison: Comparison, dataset: str) -> Drawn:
         picture.finding,
     )
     write_atomically(drawn.path, as_png(picture.figure, {"Software": None}))
+    picture.figure.set_layout_engine("none")  # a second layout would take as long as the first
     write_atomically(drawn.svg, as_svg(picture))
     return drawn
 

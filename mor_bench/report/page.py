@@ -15,6 +15,7 @@ from markupsafe import Markup, escape
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.told import LEGEND, classes_of, is_observed, told_text
 from mor_bench.hard_cases.suite import StressResults
+from mor_bench.report.canvas import Drawn
 from mor_bench.report.details import overall
 from mor_bench.report.entries import Analysis, dataset_names
 from mor_bench.report.figures import write_figures
@@ -81,6 +82,26 @@ def render(
     """
     analysis = analysis or analyse(comparison)
     drawn = write_figures(comparison, analysis)
+    return [
+        *(figure.path for figure in drawn),
+        *write_page(comparison, analysis, drawn, pages=pages),
+    ]
+
+
+def write_page(
+    comparison: Comparison,
+    analysis: Analysis,
+    drawn: Sequence[Drawn] = (),
+    *,
+    pages: bool = False,
+) -> list[Path]:
+    """Write the page, and those in OUT/pages/ as `render` does; `drawn` are the figures on disk.
+
+    Returns
+    -------
+    list of Path
+        The pages, OUT/report.html last.
+    """
     datasets = dataset_names(comparison)
     named = {
         name: short_names(row for row in comparison.rows if row.dataset == name)
@@ -89,7 +110,7 @@ def render(
     room = BODY_BYTES // max(len(datasets), 1)
     view = View(comparison, analysis, drawn, named, room)
     frame = Frame("mor-bench report", [], "", inlined(), _stressed(comparison))
-    written = [figure.path for figure in drawn]
+    written: list[Path] = []
     if pages or len(datasets) > 1 or (comparison.out / PAGES).is_dir():  # never leave old ones
         written += _write_pages(view, frame)
         frame = replace(frame, links=[(f"{PAGES}/index.html", "A page per dataset and method")])
