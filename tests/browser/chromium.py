@@ -80,7 +80,9 @@ def visit(browser: Browser, path: Path, width: int = 1400, **options: Any) -> It
     page.on("pageerror", lambda error: found.errors.append(str(error)))
     page.on("dialog", lambda dialog: found.errors.append(f"dialog: {dialog.message}"))
     page.goto(path.as_uri())
-    page.locator('.chart [data-drawn="yes"]').first.wait_for(state="attached", timeout=120_000)
+    page.locator(".chart").first.scroll_into_view_if_needed()  # a chart is drawn when it is near
+    page.locator('.chart [data-drawn="yes"]').first.wait_for(state="attached", timeout=60_000)
+    page.evaluate("window.scrollTo(0, 0)")
     yield found
     context.close()
 
