@@ -18,7 +18,10 @@ Object.assign(Report, (() => {
   // Between powers of ten there is no room for numbers on a phone, unless the axis is short.
   function logAxis(title, more = {}) {
     const [low, high] = more.range ?? [0, 0];
-    const decades = isNarrow() && Math.floor(high) > Math.ceil(low) ? { dtick: 1 } : {};
+    // Between 1 and 10, labels at 2 and 5 have room; all nine would cover each other.
+    const few = high - low > 4 ? 1 : "D2";
+    const decades = isNarrow() && Math.floor(high) > Math.ceil(low) ? { dtick: 1 }
+      : high - low > 0.9 ? { dtick: few } : {};
     return axis(title, { type: "log", ...decades, ...more });
   }
 
