@@ -66,9 +66,8 @@ def deformation(entries: Sequence[Entry], found: Sequence[Sampled] = ()) -> str:
     linear = next((e for e in entries if e.method == "linear-fem" and e.ran), None)
     if linear is not None:
         error = percent(linear.error)
-        said += (
-            f" The linear model has an error of {error} % (median): so nonlinear are the answers."
-        )
+        said += f" The linear model has an error of {error} % (median): a measure of how nonlinear "
+        said += "the answers are."
     return said
 
 
