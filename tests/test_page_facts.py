@@ -81,8 +81,9 @@ def test_every_scene_of_the_suite_has_a_sentence(name: str) -> None:
 def test_the_sentence_of_a_scene() -> None:
     text = scene_text(load_dataset_spec("beam-coarse").model_dump(mode="json"))
     assert text == (
-        "Box of 4 × 1 × 1 m, Saint Venant-Kirchhoff (E 500 Pa, ν 0.4), supported at x-min with "
-        "1 dead force of 0 to 1 N in any direction on z-max, each on a patch of 0.11 m²."
+        "Box of 4 × 1 × 1 m, Saint Venant-Kirchhoff (E 500 Pa, ν 0.4), clamped at x-min with "
+        "one dead force of 0 to 1 N in any direction on z-max, as a uniform traction on a patch of "
+        "0.11 m² each."
     )
     text = scene_text(load_dataset_spec("artery-pressure").model_dump(mode="json"))
     assert "on springs with dead pressures of 0 to 20000 Pa on inner and outer." in text

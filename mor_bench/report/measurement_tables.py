@@ -80,7 +80,8 @@ def indicated(entries: Sequence[Entry]) -> TextTable | None:
         "Indicated: an estimate of the relative L2 error (`Surrogate.indicate_error`). It "
         "is the first correction that the full-order solve would make, relative to the "
         "prediction. It costs about one iteration of that solve. For comparison, the "
-        "residual relative to the load is shown. Measured on a part of the test set; "
+        "rank correlation of the error with the residual, relative to the load, is shown; the "
+        "residual itself is not. Measured on a part of the test set; "
         "exact answers are left out."
     )
     return table_of("Indicated errors", note, entries, columns)

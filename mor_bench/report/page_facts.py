@@ -65,9 +65,12 @@ def deformation(entries: Sequence[Entry], found: Sequence[Sampled] = ()) -> str:
     )
     linear = next((e for e in entries if e.method == "linear-fem" and e.ran), None)
     if linear is not None:
-        error = percent(linear.error)
-        said += f" The linear model has an error of {error} % (median): a measure of how nonlinear "
-        said += "the answers are."
+        shares = {"median": linear.error}
+        for name, figure in (("95th percentile", "rel_l2_p95"), ("largest", "rel_l2_max")):
+            if (value := linear.figure("error", figure)) is not None:
+                shares[name] = value
+        errors = ", ".join(f"{percent(value)} % ({name})" for name, value in shares.items())
+        said += f" Errors of the linear model, which tell how nonlinear the answers are: {errors}."
     return said
 
 

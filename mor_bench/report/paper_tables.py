@@ -172,8 +172,9 @@ def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable
     return [
         _comparison(
             "Comparison at the same error",
-            f"The fastest configuration of each method that is as accurate as {network.label} "
-            f"(ē = {error} m), by the error that the verdict uses.",
+            "The fastest configuration of each method whose error by the rule of the verdict (the "
+            f"95 % upper bound of the median) is at most that of {network.label} (ē = {error} m). "
+            "ē does not select: a method can have a smaller one, and still not reach this bound.",
             _least(methods, accurate, lambda e: e.latency_ms),
             SAME_ERROR if scene_of(dataset) == COMPARED else {},
         ),

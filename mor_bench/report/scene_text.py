@@ -23,6 +23,7 @@ from mor_bench.specs import (
     TubeGeometry,
     load_recorded_spec,
 )
+from mor_bench.specs.support_spec import AXES
 
 LAWS = {
     "saint-venant-kirchhoff": "Saint Venant-Kirchhoff",
@@ -63,9 +64,7 @@ def scene_text(content: Mapping[str, Any]) -> str:
         return ""
     parts = [
         f"{_body(spec)}, {_material(spec)}",
-        f"supported at {_regions(support.region for support in spec.supports)}"
-        if spec.supports
-        else "",
+        _supports(spec),
         "under gravity" if spec.gravity else "",
         "on springs" if spec.springs else "",
         f"with {_loads(spec.loads)}{_parameters(spec)}.",
@@ -112,6 +111,14 @@ def _parameters(spec: DatasetSpec) -> str:
     return f"; sampled per body: {', '.join(ranges)}"
 
 
+def _supports(spec: DatasetSpec) -> str:
+    """Name the regions that are clamped, and those that are held in some directions only."""
+    clamped = [s.region for s in spec.supports if s.direction is None and s.components == AXES]
+    others = [s.region for s in spec.supports if s.region not in clamped]
+    parts = [("clamped at", clamped), ("on rollers at", others)]
+    return " and ".join(f"{how} {_regions(regions)}" for how, regions in parts if regions)
+
+
 def _regions(regions: Iterable[Region]) -> str:
     """Name regions that have a name, or are sets of nodes."""
     names = (
@@ -143,10 +150,11 @@ def _loads(loads: AnyLoads) -> str:
         kind = "following" if loads.follower else "dead"
         return f"{kind} pressures of {ends} on {_regions(loads.regions)}"
     n, how = loads.simultaneous, DIRECTIONS[loads.kind]
-    forces = f"{n} dead force{'s' if n != 1 else ''} of {ends} {how}"
+    count = "one dead force" if n == 1 else f"{n} dead forces"
+    forces = f"{count} of {ends} {how}"
     if isinstance(loads, LineLoads):
         return f"{forces} along lines"
     where = f"{forces} on {_regions([loads.region])}"
     if isinstance(loads, PointLoads):
         return f"{where}, each at a point"
-    return f"{where}, each on a patch of {loads.patch_area_m2:g} m²"
+    return f"{where}, as a uniform traction on a patch of {loads.patch_area_m2:g} m² each"
