@@ -291,9 +291,17 @@ def test_mutated_models_are_read_or_refused(
     attacked(model_reader(model, read), tmp_path, n)
 
 
-@pytest.mark.nightly
-def test_mutated_models_with_their_scenes_are_read_or_refused(model: Path, tmp_path: Path) -> None:
-    attacked(model_reader(model, mor_bench.load_surrogate), tmp_path, SLOW)
+@pytest.mark.parametrize(
+    "n",
+    [
+        pytest.param(QUICK, marks=pytest.mark.slow),
+        pytest.param(SLOW, marks=pytest.mark.nightly),
+    ],
+)
+def test_mutated_models_with_their_scenes_are_read_or_refused(
+    model: Path, tmp_path: Path, n: int
+) -> None:
+    attacked(model_reader(model, mor_bench.load_surrogate), tmp_path, n)
 
 
 def test_the_documented_counts_are_those_of_these_tests() -> None:

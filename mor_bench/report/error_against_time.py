@@ -90,9 +90,8 @@ def fastest(shown: Sequence[Entry], needs: Requirements, verdict: Mapping[str, A
     if other.label in verdict.get("undecided", ()):
         return f"{text}, not surely faster than {shortened(other.method, 40)}"
     times = f"{other.latency_ms / choice.latency_ms:.2g}"
-    tolerance = other.row.parameters.get("tolerance") if other.row.reference else None
-    at = "" if tolerance is None else f" at tolerance {tolerance:g}"
-    return f"{text}, {times} times as fast as {shortened(other.method, 40)}{at}"
+    name = str(short_names(e.row for e in shown)[other.label])
+    return f"{text}, {times} times as fast as {shortened(name, 40)}"
 
 
 def draw_frontier(axes: Axes, entries: Sequence[Entry], needs: Requirements) -> None:

@@ -52,7 +52,7 @@ def _missed(entry: Entry, needs: Requirements) -> list[tuple[str, str, str]]:
     return [(shown.get(name, name), bound, limit) for name, bound, limit in missed]
 
 
-def deformation(entries: Sequence[Entry], found: Sequence[Sampled] = ()) -> str:
+def deformation(entries: Sequence[Entry], found: Sequence[Sampled]) -> str:
     """State how far the test loads move the body, and how nonlinear that is; empty if unknown."""
     known = (entry.figure("error", "amplitude_m") for entry in entries)
     largest = next((value for value in known if value), None)

@@ -113,9 +113,10 @@ def _parameters(spec: DatasetSpec) -> str:
 
 def _supports(spec: DatasetSpec) -> str:
     """Name the regions that are clamped, and those that are held in some directions only."""
-    clamped = [s.region for s in spec.supports if s.direction is None and s.components == AXES]
-    others = [s.region for s in spec.supports if s.region not in clamped]
-    parts = [("clamped at", clamped), ("on rollers at", others)]
+    whole = [s.direction is None and set(s.components) == set(AXES) for s in spec.supports]
+    clamped = [s.region for s, all_of_it in zip(spec.supports, whole, strict=True) if all_of_it]
+    others = [s.region for s, all_of_it in zip(spec.supports, whole, strict=True) if not all_of_it]
+    parts = [("clamped at", clamped), ("held in some directions at", others)]
     return " and ".join(f"{how} {_regions(regions)}" for how, regions in parts if regions)
 
 

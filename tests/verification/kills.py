@@ -113,12 +113,6 @@ def outliving(folder: Path) -> list[str]:
     return found
 
 
-def heed_signals() -> None:
-    """Let the commands heed the signals: `nohup` or a shell may have told this process not to."""
-    for name in SIGNALS[1:]:
-        signal.signal(signal.Signals[name], signal.SIG_DFL)
-
-
 def start(command: str, folder: Path) -> subprocess.Popen[bytes]:
     (folder / "tmp").mkdir(parents=True, exist_ok=True)
     environment = {
@@ -152,6 +146,8 @@ def kill_often(
     """Kill a command many times and compare it with an undisturbed one."""
     draw, outcome, command = random.Random(seed), Outcome(), expected.command
     folder = parent / f"{command}-{number.name}-0"
+    if number != signal.SIGKILL:  # `nohup` or a shell may have told this process to ignore it,
+        signal.signal(number, signal.SIG_DFL)  # and so its children
     while outcome.kills < kills:
         process = start(command, folder)
         try:
@@ -199,7 +195,6 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file to write the outcomes to")
     given = parser.parse_args()
     wrong, rows = 0, []
-    heed_signals()
     with tempfile.TemporaryDirectory() as parent:
         for command in given.commands:
             undisturbed(command, Path(parent) / f"{command}-first")  # compiles the kernels

@@ -9,14 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.verification.kills import (
-    COMMANDS,
-    SIGNALS,
-    Undisturbed,
-    heed_signals,
-    kill_often,
-    undisturbed,
-)
+from tests.verification.kills import COMMANDS, SIGNALS, Undisturbed, kill_often, undisturbed
 
 
 @pytest.fixture(scope="module", params=COMMANDS)
@@ -26,13 +19,14 @@ def expected(
     return undisturbed(request.param, tmp_path_factory.mktemp("undisturbed"))
 
 
-@pytest.mark.nightly
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 @pytest.mark.parametrize("name", SIGNALS)
+@pytest.mark.parametrize(
+    "kills", [pytest.param(1, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.nightly)]
+)
 def test_a_killed_command_leaves_nothing_and_ends_with_the_same_result(
-    expected: Undisturbed, name: str, tmp_path: Path
+    expected: Undisturbed, name: str, kills: int, tmp_path: Path
 ) -> None:
-    heed_signals()
-    found = kill_often(expected, signal.Signals[name], 2, tmp_path, int(time.time()))
-    assert found.kills == 2
+    found = kill_often(expected, signal.Signals[name], kills, tmp_path, int(time.time()))
+    assert found.kills == kills
     assert not found.wrong
