@@ -159,7 +159,7 @@ samples = 20
     )
     assert "2 tables of loads, 20 samples" in check_file(path)
     text = scene_text(load_scene(path).spec.model_dump(mode="json"))
-    assert "dead pressures of 0 to 8 Pa on x-max, and 1 dead force" in text
+    assert "dead pressures of 0 to 8 Pa on x-max, and one dead force" in text
 
 
 FOLLOWING = {**PRESSURE, "follower": True}
