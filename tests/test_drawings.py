@@ -166,8 +166,10 @@ def test_the_slope_of_the_paper_is_drawn_on_its_scenes_only(
 @pytest.mark.parametrize(
     ("verdict", "ratio", "low", "high", "cell", "interval"),
     [
-        ("undecided", 0.8, 0.5, 1.25, "?1.25", "0.8–2"),
-        ("undecided", 0.8, 0.5, None, "?1.25", "0–2"),
+        ("undecided", 0.8, 0.5, 1.25, "?+1.25", "0.8–2"),
+        ("undecided", 0.8, 0.5, None, "?+1.25", "0–2"),
+        ("undecided", 1.25, 0.8, 2.0, "?-1.25", "0.8–2"),
+        ("undecided", 1.25, None, None, "?-1.25", "no interval"),
         ("faster", 0.5, 0.4, 0.8, "+2", "1.25–2.5"),
         ("faster", 0.5, None, 0.8, "+2", "1.25–∞"),
         ("slower", 2.0, 1.6, 2.5, "-2", "1.6–2.5"),

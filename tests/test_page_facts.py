@@ -23,6 +23,7 @@ from mor_bench.report.page_facts import (
     machine_facts,
     method_facts,
     reason_of,
+    untested_of,
 )
 from mor_bench.report.page_samples import Sampled
 from mor_bench.report.page_strains import strain_facts
@@ -53,12 +54,17 @@ def entry(error: float, latency_ms: float, n_failed: int = 0) -> Entry:
 
 def test_a_configuration_that_does_not_qualify_names_the_limits_that_it_misses() -> None:
     assert answer_of(replace(entry(0.001, 1.0), qualified=True), NEEDS) == "yes"
-    assert answer_of(entry(0.02, 1.0), NEEDS) == "no: error up to 2 %"
-    assert answer_of(entry(0.02, 4.0), NEEDS) == "no: error up to 2 %, latency up to 4 ms"
+    assert answer_of(entry(0.02, 1.0), NEEDS) == "no: median error, 95 % bound 2 %"
+    assert answer_of(entry(0.02, 4.0), NEEDS) == (
+        "no: median error, 95 % bound 2 %, latency, 95 % bound 4 ms"
+    )
     assert answer_of(entry(0.001, 1.0, n_failed=2), NEEDS) == "no: loads without an answer"
     assert answer_of(Entry(a_row("pod", status="failed", reason="x")), NEEDS) == "failed"
     text = reason_of(entry(0.02, 4.0), NEEDS)
-    assert text == "no: error: upper bound 2 %, limit 1 %; latency: upper bound 4 ms, limit 3 ms"
+    assert text == (
+        "no: median error: 95 % upper bound 2 %, limit 1 %; "
+        "latency: 95 % upper bound 4 ms, limit 3 ms"
+    )
 
 
 def test_the_validation_part_and_its_interval_give_the_reason() -> None:
@@ -66,8 +72,10 @@ def test_the_validation_part_and_its_interval_give_the_reason() -> None:
     sure = Entry(row, intervals={"validation_rel_l2_median": (0.002, 0.009)})
     unsure = Entry(row, intervals={"validation_rel_l2_median": (0.002, 0.0118)})
     assert answer_of(sure, NEEDS) == "no"
-    assert reason_of(unsure, NEEDS) == "no: validation error: upper bound 1.18 %, limit 1 %"
-    assert answer_of(unsure, NEEDS) == "no: validation error up to 1.18 %"
+    assert reason_of(unsure, NEEDS) == (
+        "no: median validation error: 95 % upper bound 1.18 %, limit 1 %"
+    )
+    assert answer_of(unsure, NEEDS) == "no: median validation error, 95 % bound 1.18 %"
 
 
 @pytest.mark.parametrize("name", list_suite("datasets"))
@@ -142,7 +150,8 @@ def test_the_page_tells_how_to_run_again_and_what_was_not_tested(tmp_path: Path)
         limits_of(run, analyse(run), tested)
     )
     assert len(unmeasured(run, "beam-tiny", tested)) == 1
-    assert "Not tested for what they are built for: pod." in text
+    untested = untested_of(analyse(run), entries)
+    assert untested == {"pod": "0 degrees of freedom; it needs 1,000,000"}
     assert text.endswith("do not hold its random seed, `--seeds 3` measures it.")
 
 
@@ -188,10 +197,12 @@ def test_a_run_records_its_commit_and_the_one_at_which_it_continues(
 
 def test_the_size_of_a_network_stands_beside_that_of_the_paper(tmp_path: Path) -> None:
     made = synthetic_comparison(tmp_path, per_region=4)
-    row = made.rows[0].with_parts(parameters={"channels": 16, "steps": 2})
+    row = made.rows[0].with_parts(parameters={"channels": 16, "steps": 2}, told="equations")
     assert paper_size(row) == (
         "16 channels and 2 steps (the paper's network: 128 channels and 3 steps); "
     )
+    command = f"mor-bench run beam-coarse --profile full -m '{row.method}[channels=128,steps=3]'"
+    assert f"3 steps, trained by `{command}`); " in paper_size(row.with_parts(told="input"))
     assert paper_size(made.rows[0]) == ""
     text = interval_basis("beam-coarse", analyse(made, n_resamples=77))
     assert "(bootstrap of 77 resamples)" in text

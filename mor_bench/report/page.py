@@ -26,7 +26,7 @@ from mor_bench.report.page_facts import AGAIN, machine_facts, method_facts
 from mor_bench.report.page_index import standings
 from mor_bench.report.page_scripts import Assets, beside, embedded_json, inlined
 from mor_bench.report.page_sections import View, section_of
-from mor_bench.report.page_tables import with_content
+from mor_bench.report.page_tables import in_python, with_content
 from mor_bench.report.short_names import short_names
 from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
@@ -219,7 +219,12 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         finalize=_joined,
     )
-    environment.filters |= {"data_uri": _data_uri, "code": _code, "slug": _slug}
+    environment.filters |= {
+        "data_uri": _data_uri,
+        "code": _code,
+        "slug": _slug,
+        "in_python": in_python,
+    }
     return environment
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any
 
@@ -34,7 +34,10 @@ from mor_bench.results.comparison import Comparison
 
 @dataclass(frozen=True)
 class Shown:
-    """A dataset's entries with their short names and the verdict card."""
+    """A dataset's entries with their short names and the verdict card.
+
+    `untested` says, by method, why the comparison does not test it where it is built for.
+    """
 
     comparison: Comparison
     dataset: str
@@ -42,6 +45,7 @@ class Shown:
     entries: Sequence[Entry]
     names: Mapping[str, str]
     card: Card
+    untested: Mapping[str, str] = field(default_factory=dict)
 
 
 def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
@@ -101,9 +105,11 @@ def _row(shown: Shown, entry: Entry, needs: Requirements) -> dict[str, Any]:
     """Return the figures of one configuration: errors in %, latencies in ms, cost in core-s."""
     comparison, names = shown.comparison, shown.names
     error, latency = entry.intervals.get("rel_l2_median"), entry.intervals.get("latency_ms")
+    untested = shown.untested.get(entry.method)
     return {
         "label": entry.label,
         "name": names[entry.label],
+        "untested": bool(untested),
         "method": entry.method,
         "told": entry.row.told or "",
         "group": entry.group,
@@ -129,22 +135,18 @@ def _row(shown: Shown, entry: Entry, needs: Requirements) -> dict[str, Any]:
         "work": entry.figure("cost", "multiply_adds"),
         "offline": entry.row.offline_core_s,
         "cells": cells_of(entry),
-        "hover": hover_of(entry, names),
+        "hover": [*hover_of(entry, names), *([f"† {untested}"] if untested else [])],
         "details": details_of(
             entry,
-            [*method_facts(comparison, entry.method), *_untested(shown, entry.method)],
+            [*method_facts(comparison, entry.method), *_tested(untested)],
             reason_of(entry, needs),
         ),
     }
 
 
-def _untested(shown: Shown, method: str) -> list[tuple[str, str]]:
+def _tested(untested: str | None) -> list[tuple[str, str]]:
     """Say why the comparison does not test a method where it is built for; nothing if it does."""
-    return [
-        ("tested there", f"no: {record['verdict'].partition('. It is for: ')[0]}")
-        for record in shown.analysis["regimes"]
-        if record["method"] == method and record["in_regime"] is False
-    ]
+    return [("tested there", f"no: {untested}")] if untested else []
 
 
 def cells_of(entry: Entry) -> dict[str, list[str]]:

@@ -25,10 +25,13 @@ from mor_bench.results.comparison import Comparison
 
 
 def answer_of(entry: Entry, needs: Requirements) -> str:
-    """Say whether a configuration qualifies, or why not: "no: validation error up to 2 %"."""
+    """Say whether a configuration qualifies, or why not: "no: median error, 95 % bound 2 %"."""
     if entry.qualified or not entry.ran:
         return "yes" if entry.qualified else entry.row.status
-    missed = [f"{name} up to {bound}" for name, bound, _ in _missed(entry, needs)]
+    missed = [
+        f"{name}{', 95 % bound' if name in _UNCERTAIN else ':'} {bound}"
+        for name, bound, _ in _missed(entry, needs)
+    ]
     missed += ["loads without an answer"] if entry.n_failed else []
     return f"no: {', '.join(missed)}" if missed else "no"
 
@@ -36,7 +39,7 @@ def answer_of(entry: Entry, needs: Requirements) -> str:
 def reason_of(entry: Entry, needs: Requirements) -> str:
     """As `answer_of`, with the upper bounds and the limits."""
     missed = [
-        f"{name}: upper bound {bound}, limit {limit}"
+        f"{name}: {'95 % upper bound ' if name in _UNCERTAIN else ''}{bound}, limit {limit}"
         for name, bound, limit in _missed(entry, needs)
     ]
     return f"no: {'; '.join(missed)}" if entry.ran and missed else answer_of(entry, needs)
@@ -46,10 +49,16 @@ def _missed(entry: Entry, needs: Requirements) -> list[tuple[str, str, str]]:
     """List the limits that a configuration misses; its error is that on the validation part."""
     if entry.qualified:
         return []
-    error = FIGURE_NAMES["error"]
-    shown = {error: f"validation {error}"} if entry.row.validation else {}
+    shown = {FIGURE_NAMES["error"]: _MEDIANS[bool(entry.row.validation)]}
     missed = limits_missed(bounds_of(entry.row, entry.intervals), needs)
     return [(shown.get(name, name), bound, limit) for name, bound, limit in missed]
+
+
+_MEDIANS = ("median error", "median validation error")
+"""Names of the error that selects: on the test set, and on the validation part."""
+
+_UNCERTAIN = (*_MEDIANS, FIGURE_NAMES["latency_ms"])
+"""Figures whose 95 % upper bound must meet the limit."""
 
 
 def deformation(entries: Sequence[Entry], found: Sequence[Sampled]) -> str:
@@ -108,15 +117,19 @@ def _answered(entries: Sequence[Entry]) -> str:
     return f"{good} of {len(entries)} configurations ran and answered every test load."
 
 
+def untested_of(analysis: Analysis, entries: Sequence[Entry]) -> dict[str, str]:
+    """Say, by method, why the comparison does not test it where it is built for."""
+    present = {entry.method for entry in entries}
+    return {
+        record["method"]: record["verdict"].partition("(")[2].partition("). It is for: ")[0]
+        for record in analysis["regimes"]
+        if record["in_regime"] is False and record["method"] in present
+    }
+
+
 def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entry]) -> str:
     """State for what a run holds, and what it does not tell: regimes, other loads, other seeds."""
     dataset = next((entry.row.dataset for entry in entries), "")
-    present = {entry.method for entry in entries}
-    outside = [
-        record["method"]
-        for record in analysis["regimes"]
-        if record["in_regime"] is False and record["method"] in present
-    ]
     said = [_compared(comparison, entries), _answered(entries)]
     said.append(
         "Data, fits and errors hold for this body, material, supports and kind of load only; "
@@ -132,8 +145,6 @@ def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entr
     said.append(renamed(beyond, short_names(entry.row for entry in entries)))
     if processor := comparison.machine.get("processor"):
         said.append(f"Latencies hold for {processor}; `--retime` measures them on another machine.")
-    if outside:
-        said.append(f"Not tested for what they are built for: {', '.join(outside)}.")
     if comparison.settings.get("seeds") == 1:
         said.append(
             "One training each: the intervals do not hold its random seed, `--seeds 3` measures it."
@@ -261,6 +272,13 @@ def _patches(spec: Mapping[str, Any], entries: Sequence[Entry]) -> str:
     parts = {"training": row.n_train, "validation": row.n_validation, "test": row.n_test}
     counts = [f"{n // each} {part}" for part, n in parts.items() if n]
     return f"; load patches: {', '.join(counts)}, none in two parts"
+
+
+def n_refined(spec: Mapping[str, Any]) -> int:
+    """Count the loads that the discretisation error was measured with; 0 if it was not."""
+    found = recorded_scene(spec)
+    record = measured(found) if found else None
+    return 0 if record is None else len(record["loads"])
 
 
 def _refinement(spec: Mapping[str, Any]) -> list[tuple[str, str]]:

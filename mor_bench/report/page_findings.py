@@ -35,7 +35,8 @@ def frontier(data: Data, title: str) -> Chart:
     """Return the chart of error against latency."""
     reading = (
         "Left and down is better. Lines join the configurations of a method. Bars are 95 % "
-        "intervals, for medians only. Open markers: the timing was not stable. A label with a "
+        "intervals, for medians only. Open markers: the timing was not stable. A dagger (†): not "
+        "tested where the method is built for, see the table. A label with a "
         "value belongs to a marker beyond the axis, drawn at its edge. On a phone, the list below "
         "names the numbers. The dashed steps are the Pareto front; they also run through "
         "references, which get no mark in the tables. References solve the full equations on "

@@ -21,7 +21,9 @@ from mor_bench.report.page_facts import (
     facts_of,
     limits_of,
     method_facts,
+    n_refined,
     protocol_of,
+    untested_of,
 )
 from mor_bench.report.page_findings import Chart, charts, frontier
 from mor_bench.report.page_samples import dataset_arrays, sampled
@@ -59,6 +61,7 @@ class Section:
     `details` all further tables.
     `body_picture` replaces the turning bodies on paper. `worst` describes the worst test loads by
     label, and `faster` is the title of the table of pairs. `protocol` says how all was measured.
+    `untested` says, by method, why it is not tested where it is built for.
     `data` is the content for the scripts.
     """
 
@@ -75,6 +78,7 @@ class Section:
     constants: str
     short_names: str
     basis: str
+    untested: Mapping[str, str]
     facts: list[tuple[str, str]]
     failures: list[Event]
     events: list[Event]
@@ -124,7 +128,8 @@ def section_of(view: View, dataset: str) -> Section:
     named, needs = view.names[dataset], needs_of(comparison, dataset)
     names = {label: str(name) for label, name in named.items()}
     verdict = _card(view, dataset, entries, names)
-    shown = Shown(comparison, dataset, analysis, entries, names, verdict)
+    untested = untested_of(analysis, entries)
+    shown = Shown(comparison, dataset, analysis, entries, names, verdict, untested)
     data = payload(shown, view.body_bytes)
     tables = [target_table(comparison, dataset, kind, analysis) for kind in _TARGETS]
     tables += [*dataset_details(comparison, dataset, analysis), *figure_tables(entries)]
@@ -154,6 +159,7 @@ def section_of(view: View, dataset: str) -> Section:
         constants=constants(rows),
         short_names=explain_short_names(entry.swept for entry in entries),
         basis=interval_basis(dataset, analysis),
+        untested=untested,
         facts=[
             *facts_of(comparison, dataset, entries),
             *strain_facts(samples, dataset_arrays(comparison, dataset)),
@@ -193,7 +199,8 @@ def _card(view: View, dataset: str, entries: Sequence[Entry], names: Mapping[str
         ]
         for key in ("pairwise", "break_even")
     )
-    return card(found, entries, names, FullOrder(costs, pairs, break_even))
+    n = n_refined(view.comparison.datasets.get(dataset, {}))
+    return card(found, entries, names, FullOrder(costs, pairs, break_even, n))
 
 
 def _events(view: View, dataset: str, entries: Sequence[Entry]) -> list[Event]:

@@ -84,10 +84,22 @@ GROUPS: dict[str, dict[str, Cell]] = {
 }
 """Groups of figures; `table_of` leaves out those that no configuration has."""
 
+RELATIVE = ("Relative L2 error (%)", "Error at the tip, the node that moves most (%)")
+"""Groups of errors that are divided by the reference."""
+
+SMALL = (
+    "Each error is divided by its reference: the largest ones often belong to loads that hardly "
+    "move the body. The card names the worst loads, with their errors in mm."
+)
+"""Note of these groups."""
+
 
 def figure_tables(entries: Sequence[Entry]) -> list[TextTable]:
     """Build one table per group of figures, with a row per configuration."""
-    tables = (table_of(title, "", entries, cells) for title, cells in GROUPS.items())
+    tables = (
+        table_of(title, SMALL if title in RELATIVE else "", entries, cells)
+        for title, cells in GROUPS.items()
+    )
     return [table for table in tables if table is not None]
 
 
@@ -113,7 +125,11 @@ def details_of(
     notes += [("timing not stable", reason) for reason in entry.unstable]
     notes += [("warning", warning) for warning in entry.row.warnings]
     groups = [("Method", list(about)), ("Notes", notes), *found]
-    return [(group, figures) for group, figures in groups if figures]
+    return [
+        (group, [(name, text.replace("`", "")) for name, text in figures])
+        for group, figures in groups
+        if figures
+    ]
 
 
 def run_again(entry: Entry) -> str:
@@ -125,6 +141,20 @@ def run_again(entry: Entry) -> str:
     method = f"{row.method}[{values}]" if chosen else row.method
     train = ["--train"] if row.training or row.trained_elsewhere else []
     return shlex.join(["mor-bench", "run", row.dataset, "-m", method, *train])
+
+
+def in_python(entry: Entry) -> str:
+    """Return the lines of Python that fit this configuration and predict with it."""
+    row = entry.row
+    given = "".join(f", {key}={value!r}" for key, value in row.swept.items())
+    return "\n".join(
+        [
+            f'data = mor_bench.load_dataset("{row.dataset}")',
+            f'method = mor_bench.load_method("{row.method}"{given})',
+            "method.fit(data.scene, data.train)",
+            "u = method.predict(data.test.forces[0])",
+        ]
+    )
 
 
 def with_content(tables: Sequence[TextTable]) -> list[TextTable]:

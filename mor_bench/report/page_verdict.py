@@ -13,10 +13,7 @@ from mor_bench.report.number_format import DASH, number, percent, span, whole
 from mor_bench.report.short_names import renamed
 from mor_bench.report.whole_cost import Costs
 
-MESH_MEANING = (
-    "For the real body, this comparison cannot rank configurations with a smaller error. The "
-    "ranking and the needed error hold for this mesh's own solution."
-)
+MESH_MEANING = "Below that, a ranking says nothing about the real body."
 """What a discretisation error means for the ranking."""
 
 MOST_NAMES = 4
@@ -45,11 +42,13 @@ class FullOrder:
     """What is known of the winner against the full-order model.
 
     `pairs` and `break_even` are records of the analysis for this dataset at the required error.
+    `n_refined` is the number of loads that the discretisation error was measured with; 0: unknown.
     """
 
     costs: Costs | None = None
     pairs: Sequence[Mapping[str, Any]] = ()
     break_even: Sequence[Mapping[str, Any]] = ()
+    n_refined: int = 0
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,12 @@ def card(
     stability, _, command = unsteady.partition(" Time again: ")
     mesh = next((s for s in sentences if s.startswith("The discretisation error")), "")
     if " is " in mesh:
-        mesh = f"{mesh.split('. ')[0]}. {MESH_MEANING}"
+        counted = (
+            f"(median of {known.n_refined} loads)" if known and known.n_refined else "(median)"
+        )
+        size = mesh.partition(" is ")[2].partition(" (median)")[0]
+        mesh = f"Errors are against FEM on this mesh, whose own error is {size} {counted}. "
+        mesh += MESH_MEANING
     rankings = []
     if qualified:
         undecided = [names[label] for label in verdict["undecided"] if label in names]
@@ -163,42 +167,47 @@ def _by_latency(
     others: tuple[Sequence[Entry], FullOrder | None],
 ) -> Ranking:
     entries, known = others
-    first = qualified[0]
+    first, winner = qualified[0], names[qualified[0].label]
     second = next((e for e in qualified if e.label == runner_up), None)
     picks = [_pick("fastest", first, names)]
     picks += [_pick(RUNNER_UP, second, names)] if second else []
     if undecided:
         sentence = f"Its latency cannot be told apart from that of {listed(undecided)}."
     elif len(qualified) > 1:
-        sentence = (
-            "It is faster than every other configuration that qualifies: no 95 % interval of the "
-            "ratio of their latencies contains 1."
-        )
+        sentence = "It is faster than all others that qualify (95 % intervals of the ratios)."
     else:
         sentence = "No other configuration that was tried qualifies."
     sentence += f" {NO_RUNNER_UP}" if second is None and len(qualified) > 1 else ""
+    sentence += _faster(entries, first, names)
     full_order = [e for e in qualified if e.row.reference]
     full_order = full_order or [e for e in entries if e.row.reference and e.ran]
     if full_order and not first.row.reference:
         fastest = min(full_order, key=lambda e: e.latency_ms)
-        ratio = number(fastest.latency_ms / first.latency_ms)
-        sentence += f" It is {ratio} times as fast as the full-order model"
-        exact = min(full_order, key=lambda e: e.error)
-        sentence += f" ({_marked(fastest, names)}"
-        if exact is not fastest:
-            times = number(exact.latency_ms / first.latency_ms)
-            sentence += f"; {times} times as {_marked(exact, names)}"
-        sentence += ")."
+        sentence += _speed_up(fastest, first, names, fastest in qualified)
         sentence += _interval_of_pair(known, fastest.method, first.method)
-        if fastest in qualified:
-            sentence += " The full-order model itself meets the needs."
     sentence += _pays_off(known, first)
-    return Ranking("latency", f"Take {names[first.label]}", picks, sentence)
+    return Ranking("latency", f"Take {winner}", picks, sentence)
 
 
-def _marked(entry: Entry, names: Mapping[str, str]) -> str:
-    """Mark a configuration whose timing is not stable, as the tables do."""
-    return names[entry.label] + ("~" if entry.unstable else "")
+def _faster(entries: Sequence[Entry], first: Entry, names: Mapping[str, str]) -> str:
+    """Name the configurations that are faster than the winner and do not qualify."""
+    faster = [e for e in entries if e.ran and e.latency_ms < first.latency_ms]
+    if not faster:
+        return ""
+    verb = "does" if len(faster) == 1 else "do"
+    ordered = sorted(faster, key=lambda e: e.latency_ms)
+    return f" Faster, but {verb} not qualify: {listed([names[e.label] for e in ordered], 2)}."
+
+
+def _speed_up(full_order: Entry, first: Entry, names: Mapping[str, str], meets: bool) -> str:
+    """State the ratio of the two latencies shown, which is the one to quote."""
+    ratio = number(full_order.latency_ms / first.latency_ms)
+    mark = "~" if full_order.unstable else ""
+    which = "that meets the needs" if meets else "that was tried; it does not qualify"
+    return (
+        f" The speed-up to quote is {ratio}: over {names[full_order.label]}{mark}, the fastest "
+        f"full-order model {which}."
+    )
 
 
 def _interval_of_pair(known: FullOrder | None, full_order: str, method: str) -> str:
@@ -209,7 +218,7 @@ def _interval_of_pair(known: FullOrder | None, full_order: str, method: str) -> 
         return ""
     ends = f"{number(pair['low'])}–{number(pair['high'])}"
     at = percent(pair["target_rel_l2_median"])
-    return f" Interpolated at {at} %: {number(pair['ratio'])} times ({ends})."
+    return f" At an equal error of {at} % it is {number(pair['ratio'])} ({ends})."
 
 
 def _pays_off(known: FullOrder | None, first: Entry) -> str:
@@ -222,8 +231,7 @@ def _pays_off(known: FullOrder | None, first: Entry) -> str:
     tuned = next((r["queries_with_tuning"] for r in records), None)
     n = first.row.n_train + (first.row.n_validation or 0)
     samples = f"{whole(n)} samples ({number(line.data)} core-s) and the" if line.data else "its"
-    text = f" Including {samples} fit, it is cheaper in total than the full-order model after "
-    text += f"{whole(line.break_even)} queries"
+    text = f" With {samples} fit, it pays off after {whole(line.break_even)} queries"
     return f"{text} ({whole(tuned)} with tuning)." if tuned is not None else f"{text}."
 
 
@@ -269,7 +277,7 @@ def _error_tail(entry: Entry) -> str:
         return ""
     return (
         f"95 % of the {entry.row.n_test:,} test loads: ≤ {percent(p95)} %; "
-        f"largest relative error: {percent(worst)} %"
+        f"largest: {percent(worst)} %"
     )
 
 
@@ -308,8 +316,8 @@ def offline_text(entry: Entry) -> str:
     return f"{number(seconds)} core-s"
 
 
-def listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str], most: int = MOST_NAMES) -> str:
     """Join names, and count those that are too many for a sentence."""
-    shown = list(names[:MOST_NAMES])
-    shown += [f"{len(names) - MOST_NAMES} more"] if len(names) > MOST_NAMES else []
+    shown = list(names[:most])
+    shown += [f"{len(names) - most} more"] if len(names) > most else []
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"

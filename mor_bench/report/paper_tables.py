@@ -58,7 +58,8 @@ def error_measures(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
     if published:
         note += (
             " The paper's networks were trained for 100,000 iterations, "
-            "timed on a GeForce 1080 Ti and tested on a random split. Errors in m compare only "
+            "timed on a GeForce 1080 Ti and tested on a random split; their minutes of training "
+            "are minutes of that graphics processor. Errors in m compare only "
             "at equal deformations: see the next table."
         )
     else:

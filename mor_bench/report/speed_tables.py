@@ -25,7 +25,7 @@ NOT_REACHED = "not reached"
 
 PAIRWISE_LEGEND = (
     "+2: the row's method is 2 times faster than the column's. -2: 2 times slower. "
-    "?1.1: 1.1 times faster, but the 95 % interval of the ratio contains 1."
+    "?: undecided, because the 95 % interval of the ratio contains 1."
 )
 
 TARGETS_NOTE = (
@@ -101,7 +101,7 @@ class Pairs:
         Methods that reach the error, and those that do not.
     cells : list of list of str
         A row for each of `methods`. ``+2.3``: it is 2.3 times faster than the column's method.
-        ``-2.3``: it is slower. ``?1.1``: undecided.
+        ``-2.3``: it is slower. ``?+1.1`` and ``?-1.1``: undecided.
     intervals : list of list of str
         95 % intervals of these factors.
     """
@@ -134,11 +134,13 @@ def pairs_at(comparison: Comparison, dataset: str, target: float, analysis: Anal
 
 def _factor(record: Mapping[str, Any]) -> tuple[str, str]:
     ratio, low, high = (record[name] for name in ("ratio", "low", "high"))
-    sign = {"faster": "+", "slower": "-", "undecided": "?"}[record["verdict"]]
-    if sign != "-":  # the record holds a ratio of times, the inverse of a speed-up
+    slower = ratio is not None and ratio > 1
+    if not slower:  # the record holds a ratio of times, the inverse of a speed-up
         ratio, low, high = (None if x is None else 1 / x for x in (ratio, high, low))
+    known = low is not None or high is not None
     interval = f"{'0' if low is None else number(low)}–{'∞' if high is None else number(high)}"
-    return f"{sign}{number(ratio)}", interval
+    unsure = "?" if record["verdict"] == "undecided" else ""
+    return f"{unsure}{'-' if slower else '+'}{number(ratio)}", interval if known else "no interval"
 
 
 def pairwise(comparison: Comparison, dataset: str, analysis: Analysis) -> list[TextTable]:

@@ -93,9 +93,12 @@ def paper_size(row: Row) -> str:
     if not isinstance(channels, int) or not isinstance(steps, int) or scene is None:
         return ""
     paper = scene.network
+    size = f"channels={paper.channels},steps={paper.steps}"
+    command = f"mor-bench run {row.dataset} --profile full -m '{row.method}[{size}]'"
+    trained = f", trained by `{command}`" if row.told == "input" else ""
     return (
         f"{channels} channels and {steps} steps (the paper's network: {paper.channels} channels "
-        f"and {paper.steps} steps); "
+        f"and {paper.steps} steps{trained}); "
     )
 
 

@@ -47,26 +47,26 @@ def test_the_legend_hides_and_isolates_by_keyboard(open_page: Visit) -> None:
     page, plot = open_page.page, open_page.page.locator(".frontier .plot")
     before = page.evaluate(VISIBLE)
     plain = pixels_of(plot)
-    assert arrow_to(open_page, "umesh:").endswith(
+    assert arrow_to(open_page, "umesh †:").endswith(
         "Enter hides or shows it, Shift+Enter shows it alone, arrow keys go to the others"
     )
     assert (np.abs(pixels_of(plot).astype(int) - plain).max(axis=2) > 60).sum() > 200  # a frame
     page.keyboard.press("Enter")
     page.wait_for_timeout(800)
-    assert set(before) - set(page.evaluate(VISIBLE)) == {"umesh"}
-    assert page.evaluate(FOCUSED).startswith("umesh:")
+    assert set(before) - set(page.evaluate(VISIBLE)) == {"umesh †"}
+    assert page.evaluate(FOCUSED).startswith("umesh †:")
     assert page.evaluate("document.activeElement.getAttribute('aria-pressed')") == "false"
     page.keyboard.press("Space")
     page.wait_for_timeout(800)
     assert page.evaluate(VISIBLE) == before
     page.keyboard.press("Shift+Enter")
     page.wait_for_timeout(800)
-    assert page.evaluate(VISIBLE) == ["umesh"]
+    assert page.evaluate(VISIBLE) == ["umesh †"]
     page.keyboard.press("Shift+Enter")
     page.wait_for_timeout(800)
     assert page.evaluate(VISIBLE) == before
     page.keyboard.press("Tab")
-    assert not page.evaluate(FOCUSED).startswith("umesh:")
+    assert not page.evaluate(FOCUSED).startswith("umesh †:")
 
 
 def test_every_legend_is_one_stop_whose_entries_arrows_reach(open_page: Visit) -> None:

@@ -164,12 +164,12 @@ def test_the_legend_hides_and_isolates_a_trace(open_page: Visit) -> None:
     entry = open_page.page.locator(".frontier .legend .traces", has_text="umesh")
     entry.locator(".legendtoggle").click()
     open_page.page.wait_for_timeout(600)
-    assert set(before) - set(open_page.page.evaluate(visible)) == {"umesh"}
+    assert set(before) - set(open_page.page.evaluate(visible)) == {"umesh †"}
     entry.locator(".legendtoggle").click()
     open_page.page.wait_for_timeout(600)
     entry.locator(".legendtoggle").dblclick()
     open_page.page.wait_for_timeout(600)
-    assert open_page.page.evaluate(visible) == ["umesh"]
+    assert open_page.page.evaluate(visible) == ["umesh †"]
 
 
 def test_the_chart_switches_to_other_figures(open_page: Visit) -> None:

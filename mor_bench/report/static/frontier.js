@@ -126,6 +126,8 @@ Report.kinds.frontier = (figure, data) => {
   }
 
   const FRONT = "Pareto front";
+  // A method's name in the legend; a dagger marks those that are not tested where they are built for.
+  const entryOf = (row) => R.plain(row.untested ? `${row.method} †` : row.method);
   const labelOf = (row) => row.name.split(" · ")[1] ?? row.name;
 
   function trace(rows, group, named) {
@@ -134,13 +136,13 @@ Report.kinds.frontier = (figure, data) => {
     const medians = error.value === "median" && time.value === "median";
     const open = (row) => (row.unstable ? "-open" : "");
     return {
-      type: "scatter", mode: "lines+markers+text", name: R.plain(rows[0].method),
+      type: "scatter", mode: "lines+markers+text", name: entryOf(rows[0]),
       legendgroup: R.plain(group), legendgrouptitle: { text: R.plain(group), font: { size: 12 } },
       x: rows.map(x), y: rows.map((row) => inside(y(row))),
       text: rows.map((row) => (named.has(row) ? R.plain(labelOf(row)) : "")),
       textposition: "top right", textfont: { color: R.textColourOf(style), size: 12 },
       hovertext: rows.map(hoverOf), hoverinfo: "text",
-      visible: hidden.has(R.plain(rows[0].method)) ? "legendonly" : true,
+      visible: hidden.has(entryOf(rows[0])) ? "legendonly" : true,
       line: { color: colour, width: 1 },
       marker: {
         color: colour, size: 10, line: { color: colour, width: 1.5 },
@@ -243,7 +245,7 @@ Report.kinds.frontier = (figure, data) => {
 
   function show() {
     const rows = shownRows();
-    const visible = rows.filter((row) => !hidden.has(R.plain(row.method)));
+    const visible = rows.filter((row) => !hidden.has(entryOf(row)));
     R.say(figure, finding(visible));
     const wanted = time.value === "work" || error.value !== "median" ? [] : [data.needs.latency];
     const range = {

@@ -28,7 +28,7 @@ Report.table = (grid, data) => {
     const row = cell.getRow().getData();
     const button = document.createElement("button");
     button.type = "button";
-    button.textContent = row.name;
+    button.textContent = row.untested ? `${row.name} †` : row.name;
     button.addEventListener("click", () => open(row));
     return button;
   }
