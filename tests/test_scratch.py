@@ -39,6 +39,7 @@ def test_a_container_with_the_same_name_keeps_folders_of_the_host(
         assert folder.is_dir()
 
 
+@pytest.mark.slow
 def test_a_training_leaves_no_temporary_file(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     places = {"TMPDIR": tmp_path / "tmp", "HOME": tmp_path / "home"}

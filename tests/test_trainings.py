@@ -83,6 +83,7 @@ def test_given_seconds_become_a_repeatable_number_of_iterations(
     assert training_of(again) == (70, None)
 
 
+@pytest.mark.slow
 def test_a_failed_seed_is_recorded_and_shown(comparison: Comparison, shown: list[str]) -> None:
     row = comparison.rows[0]
     assert row.seeds is not None
@@ -110,6 +111,7 @@ def test_a_failed_seed_is_recorded_and_shown(comparison: Comparison, shown: list
     assert (comparison.out / "figures" / "beam-tiny--loss-curves.png").exists()
 
 
+@pytest.mark.slow
 def test_a_training_out_of_time_reports_its_expected_duration(
     comparison: Comparison, shown: list[str]
 ) -> None:
@@ -121,6 +123,7 @@ def test_a_training_out_of_time_reports_its_expected_duration(
     assert joined_units(reason) in shown[1]
 
 
+@pytest.mark.slow
 def test_loss_curves_are_kept_with_the_samples(comparison: Comparison) -> None:
     row = comparison.rows[0]
     samples = comparison.samples(row)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from mor_bench.hard_cases.setups import of_order
@@ -24,6 +26,9 @@ from mor_bench.scene.materials import (
     Yeoh,
 )
 from mor_bench.scene.mesh import Mesh, box_mesh
+
+if TYPE_CHECKING:
+    from _pytest.mark import ParameterSet
 
 Array = NDArray[np.float64]
 FIBRES = ((1.0, 1.0, 0.0), (1.0, -1.0, 0.5))
@@ -55,6 +60,23 @@ ELEMENTS = [
 
 ISOTROPIC = [name for name in LAWS if name != "holzapfel-gasser-ogden"]
 EVERY = list(itertools.product(LAWS, ELEMENTS))
+
+
+def quick_first(pairs: Iterable[tuple[str, tuple[str, bool]]] = EVERY) -> list[ParameterSet]:
+    """Mark pairs as slow, except every element with one law and every law on one element.
+
+    The kernel of each pair is compiled on its own, which takes seconds.
+    """
+    return [
+        pytest.param(
+            law,
+            kind,
+            marks=()
+            if law == "saint-venant-kirchhoff" or kind == ELEMENTS[0]
+            else pytest.mark.slow,
+        )
+        for law, kind in pairs
+    ]
 
 
 def mesh_options(element: str) -> dict[str, Any]:
