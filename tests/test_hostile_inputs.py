@@ -14,6 +14,7 @@ import pytest
 from safetensors.numpy import save_file
 
 import mor_bench
+from mor_bench.analysis.analyse import analyse
 from mor_bench.errors import MorBenchError, SpecError, StoreError
 from mor_bench.export.vtu_files import export_vtu
 from mor_bench.model_file import read_header_and_arrays
@@ -156,9 +157,22 @@ def run(tmp_path: Path) -> Comparison:
     return made
 
 
-def test_show_refuses_a_run_without_its_samples(run: Comparison) -> None:
-    assert invoke("show", str(run.out)).exit_code == 0
+def test_show_has_the_stored_verdict_of_a_run_without_its_samples(run: Comparison) -> None:
+    run.finish(analyse(run, n_resamples=50))
+    assert " wins: " in invoke("show", str(run.out)).output
     shutil.rmtree(run.out / "samples")
+    shown = invoke("show", str(run.out))
+    assert shown.exit_code == 0
+    for words in (" wins: ", "no raw samples"):
+        assert words in " ".join(shown.output.split())
+    refused = invoke("report", str(run.out)).output
+    assert "no such file" in refused
+    assert f"`mor-bench show {run.out}` has its verdict." in refused
+    (run.out / "comparison.json").write_text('{"verdicts": [{"dataset": 3}]}')
+    shown = invoke("show", str(run.out))
+    assert shown.exit_code == 2
+    assert "not the conclusions of a run" in shown.output
+    (run.out / "comparison.json").unlink()
     shown = invoke("show", str(run.out))
     assert shown.exit_code == 2
     assert "no such file" in shown.output

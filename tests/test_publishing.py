@@ -281,6 +281,12 @@ def test_code_tables_and_links_are_no_prose() -> None:
     assert NUMBER.findall(prose(text)) == ["6"]
 
 
+def test_a_star_selects_all_items_with_a_value() -> None:
+    rows = {"rows": [{"s": {"fit": 1}, "of": 0}, {"s": {"fit": 2}}, {"s": {"fit": 3}, "of": None}]}
+    assert look_up(rows, "rows/*s/s/fit") == [1, 2, 3]
+    assert look_up(rows, "rows/*of/s/fit") == [1]
+
+
 def test_a_key_must_lead_to_one_item(claim: Statement) -> None:
     content = content_of(claim.values[0]["file"])
     assert look_up(content, "codes/1/ms/0") == 50

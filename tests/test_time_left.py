@@ -12,7 +12,8 @@ from rich.console import Console
 from mor_bench.cli import run_progress
 from mor_bench.cli.run_progress import show_run
 from mor_bench.runs.plan import Plan, StageName, Step
-from mor_bench.runs.time_left import Task, TimeLeft
+from mor_bench.runs.time_left import APART, Task, TimeLeft
+from tests.published.stored import content_of
 from tests.synthetic import a_row
 
 FITS: dict[str, list[float | None]] = {
@@ -68,7 +69,10 @@ def test_after_a_minute_the_time_left_is_right_within_a_third_if_the_plan_is_fai
     generator = np.random.default_rng(seed)
     left = TimeLeft.of(planned())
     common = generator.uniform(0.8, 1.25)
-    pace = {task.stage: common * generator.uniform(0.85, 1.15) for task in left.steps}
+    pace = {
+        task.stage: (1.0 if task.stage in APART else common) * generator.uniform(0.85, 1.15)
+        for task in left.steps
+    }
     passed = list(events(left, pace))
     end, checked = passed[-1][0], 0
     for now, task, fraction in passed[:-1]:
@@ -130,3 +134,10 @@ def test_progress_in_a_pipe_is_lines_with_the_time_left(
     with show_run(console, planned, quiet=True) as listener:
         listener.fitted(failed)
     assert capsys.readouterr().out == ""
+
+
+def test_the_dry_run_of_the_stored_first_run_was_right_within_30_percent() -> None:
+    runs = content_of("reports/start/first-run.json")["runs"]
+    assert len(runs) == 2
+    for run in runs:
+        assert run["estimated_s"] == pytest.approx(run["total_s"], rel=0.3)

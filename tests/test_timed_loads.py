@@ -12,7 +12,8 @@ from mor_bench.measure.timed_loads import CLASSES, MOST_CHANGE, TimedLoads
 from mor_bench.runs import timing_stage
 from mor_bench.runs.timing_stage import timed_numbers
 from mor_bench.snapshots.dataset import load_dataset
-from mor_bench.specs import load_dataset_spec
+from mor_bench.specs import list_suite, load_dataset_spec
+from tests.published.stored import content_of
 from tests.verification.timed_work import MOST_DIFFERENCE, timed_loads, work_ratio
 
 N = 100
@@ -85,3 +86,9 @@ def test_timed_queries_have_the_work_of_the_scored_loads(
     method = mor_bench.load_method(name, **parameters).fit(dataset.scene, dataset.train)
     ratio = work_ratio(method, dataset, timed_loads(dataset, 10 * len(dataset.test)))
     assert ratio == pytest.approx(1.0, abs=MOST_DIFFERENCE)
+
+
+def test_the_stored_counts_of_work_name_every_method_that_needs_no_observations() -> None:
+    found = content_of("reports/trust/timed_work_tiny.json")["difference_percent"]
+    names = {label.partition(" [")[0] for label in found}
+    assert names == set(list_suite("methods")) - {"gappy-pod"}

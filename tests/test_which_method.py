@@ -8,14 +8,18 @@ from typing import Any
 
 import pytest
 
+from mor_bench.report.entries import verdict_of
 from mor_bench.report.suite_overview import overview
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from tests.published.run_tables import best_of_class
-from tests.published.stored import REPORTS, ROOT
+from tests.published.stored import REPORTS, ROOT, run_of
 
 PAGE = (ROOT / "docs" / "which-method.md").read_text(encoding="utf-8")
-ROW = re.compile(r"^\| `([\w-]+)` \| \[?`([\w/-]+)`.* \| (`.*`|none qualifies) \|$", re.MULTILINE)
+ROW = re.compile(
+    r"^\| `([\w-]+)` \| \[?`([\w/-]+)`.* \| (`.*`~?|none qualifies) \| (\d+ of \d+) \|$",
+    re.MULTILINE,
+)
 
 
 def stored_verdicts() -> dict[tuple[str, str], list[str]]:
@@ -37,9 +41,28 @@ def methods_of(verdict: dict[str, Any]) -> list[str]:
 
 def test_the_page_names_the_winner_of_every_stored_run() -> None:
     named = {
-        (scene, run): re.findall(r"`([\w-]+)`", cell) for scene, run, cell in ROW.findall(PAGE)
+        (scene, run): re.findall(r"`([\w-]+)`", cell) for scene, run, cell, _ in ROW.findall(PAGE)
     }
     assert named == stored_verdicts()
+
+
+def test_the_page_tells_which_verdicts_rest_on_unstable_timings() -> None:
+    for scene, run, cell, count in ROW.findall(PAGE):
+        stored = run_of(f"reports/{run}")
+        rows = {row.label: row for row in stored.rows if row.dataset == scene and row.ok}
+        stable = {label: row.latency_ms.stable for label, row in rows.items() if row.latency_ms}
+        assert count == f"{sum(map(bool, stable.values()))} of {len(stable)}", run
+        choice = verdict_of(stored.analysis or {}, scene)["choice"]
+        unstable = choice is not None and not stable[choice]
+        assert ("`~" in cell) == unstable, run
+
+
+def test_the_page_is_right_that_no_stored_run_gives_observed_displacements() -> None:
+    runs = {run for _, run in stored_verdicts()}
+    given = [run_of(f"reports/{run}") for run in sorted(runs)]
+    specs = [spec for run in given for spec in run.datasets.values()]
+    assert len(specs) > 10
+    assert not [spec["name"] for spec in specs if spec.get("observed")]
 
 
 @pytest.mark.parametrize("beam", [True, False])

@@ -64,12 +64,11 @@ def run_card(comparison: Comparison) -> Card:
     """Describe a run: its verdicts, settings, machine and files."""
     counts = Counter(row.status for row in comparison.rows)
     settings, machine = comparison.settings, comparison.machine
-    comparison.check_samples()  # without them the verdict would be another one
-    analysis = analyse(comparison)
+    headlines = comparison.stored_headlines() if comparison.is_compact else _headlines(comparison)
     facts = {}
     for dataset in dataset_names(comparison):
         names = short_names(row for row in comparison.rows if row.dataset == dataset)
-        headline = verdict_of(analysis, dataset).get("headline", "no configuration")
+        headline = headlines.get(dataset, "no configuration")
         facts[f"verdict on {dataset}"] = renamed(headline, names)
     rows = ", ".join(f"{n} {status}" for status, n in counts.items())
     facts |= {
@@ -81,7 +80,21 @@ def run_card(comparison: Comparison) -> Card:
         "files": _files(comparison.out),
     }
     commands = [f"mor-bench report {comparison.out}", f"mor-bench report {comparison.out} --wide"]
+    if comparison.is_compact:
+        facts["files"] += "; no raw samples, so that its tables and its page cannot be made again"
+        commands = []
     return Card(f"Run {comparison.out.name}", facts, commands=commands)
+
+
+def _headlines(comparison: Comparison) -> dict[str, str]:
+    """Return the headline of the verdict on each dataset, from the raw samples."""
+    comparison.check_samples()  # without them the verdict would be another one
+    analysis = analyse(comparison)
+    return {
+        dataset: verdict_of(analysis, dataset)["headline"]
+        for dataset in dataset_names(comparison)
+        if verdict_of(analysis, dataset)
+    }
 
 
 def _machine(machine: Mapping[str, Any]) -> str:

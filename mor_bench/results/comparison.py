@@ -168,6 +168,26 @@ class Comparison:
         check_arrays(path, arrays, OF_DATASETS, lengths)
         return arrays
 
+    @property
+    def is_compact(self) -> bool:
+        """Whether the folder has the conclusions of a run without its raw samples."""
+        return (self.out / "comparison.json").is_file() and not (self.out / "samples").exists()
+
+    def stored_headlines(self) -> dict[str, str]:
+        """Read the headline of the verdict on each dataset from comparison.json.
+
+        Raises
+        ------
+        StoreError
+            If comparison.json is damaged.
+        """
+        path = self.out / "comparison.json"
+        try:
+            found = read_json(path)["verdicts"]
+            return {str(item["dataset"]): printable(str(item["headline"])) for item in found}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise StoreError(f"{path}: not the conclusions of a run ({error}).") from None
+
     def check_samples(self, dataset: str | None = None) -> None:
         """Check that the raw samples of the rows that ran exist and give the errors of these rows.
 
@@ -184,6 +204,7 @@ class Comparison:
                 f"{missing[0]}: no such file. The raw samples of {len(missing)} of {len(ran)} "
                 "configurations are missing, so their intervals are not known. Restore the "
                 "folder `samples`, or run the comparison again."
+                + (f" `mor-bench show {self.out}` has its verdict." if self.is_compact else "")
             )
         for row in ran:
             self._check_samples_of(row)

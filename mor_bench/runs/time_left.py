@@ -30,6 +30,9 @@ MOST_CORRECTION = 5.0
 MEASURED: tuple[StageName, ...] = ("timing",)
 """Stages whose share of what is done comes from measured durations of their parts."""
 
+APART: tuple[StageName, ...] = ("timing", "report")
+"""Stages whose pace does not follow from that of others."""
+
 FITTED: tuple[StageName, ...] = ("fit", "other seeds", "learning curve")
 """Stages of fits."""
 
@@ -129,8 +132,13 @@ class TimeLeft:
         return max(0.0, more / sum(len(self.steps[task]) for task in done))
 
     def _pace(self, stage: StageName) -> float:
-        """Return measured over planned seconds of the stage, or of all but fits at first."""
-        common = self._ratio([task for task in self.spent if task.stage not in FITTED], 1.0)
+        """Return measured over planned seconds of the stage, or of all but fits at first.
+
+        The turns of the timing have given seconds on every machine, and the plan of the report has
+        this machine's speed already: compilation and data say nothing about them.
+        """
+        others = [task for task in self.spent if task.stage not in FITTED]
+        common = 1.0 if stage in APART else self._ratio(others, 1.0)
         pace = self._ratio([task for task in self.spent if task.stage == stage], common)
         return min(max(pace, 1 / MOST_CORRECTION), MOST_CORRECTION)
 

@@ -14,6 +14,7 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from pathlib import Path
 from time import process_time
 from typing import Annotated, Any, Literal
@@ -80,6 +81,10 @@ def weights_drawn(kind: str) -> Callable[[nn.Module, torch.Generator], nn.Module
         return network
 
     return draw_weights
+
+
+UNSEEDED = ("local-pod", "pod")
+"""Methods without a seed, which are fitted once."""
 
 
 def open_choices() -> list[Variant]:
@@ -163,6 +168,10 @@ def other_choices() -> list[Variant]:
     for n in (64, 8, 16, 32):
         parameters = {"n_clusters": n, "n_modes": 10}
         variants.append(Variant("others", "local-pod: clusters", str(n), "local-pod", parameters))
+    for n_modes, name in product((20, 40), ("euclidean", "stiffness")):
+        parameters = {"n_modes": n_modes, "inner_product": name}
+        choice = f"pod, {n_modes} modes: inner product"
+        variants.append(Variant("others", choice, name, "pod", parameters))
     return variants
 
 
@@ -210,7 +219,7 @@ def fitted(data: Dataset, variant: Variant, seed: int) -> dict[str, Any]:
 
 def new_method(variant: Variant, seed: int) -> mor_bench.Surrogate:
     """Return the method of a variant; methods without a seed are the same for all."""
-    seeded = {} if variant.method == "local-pod" else {"seed": seed}
+    seeded = {} if variant.method in UNSEEDED else {"seed": seed}
     return mor_bench.load_method(variant.method, **variant.parameters, **seeded)
 
 
@@ -234,7 +243,7 @@ def main(
     for variant in track(variants, description=dataset):
         # Variants with equal parameters and constants are trained once.
         key = f"{new_method(variant, 0)!r} {variant.constant and variant.value}"
-        n = 1 if variant.method == "local-pod" else seeds
+        n = 1 if variant.method in UNSEEDED else seeds
         known[key] = known.get(key) or [fitted(data, variant, seed) for seed in range(n)]
         named = asdict(variant)
         del named["constant_value"]

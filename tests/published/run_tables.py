@@ -278,21 +278,25 @@ def paper(source: str, methods: str = "") -> str:
             raise EvidenceError(f"{source}: {name} is no scene of the paper, or nothing ran.")
         headings = table.headings
         told = {e.label: class_text(e.row, is_observed(run, name)) for e in entries}
-        lasted = {e.label: _iterations(e.row) for e in entries}
+        lasted = {e.label: _training(e.row) for e in entries}
         body += [
-            [name, first, told.get(first, "force only"), lasted.get(first, PAPER_ITERATIONS), *rest]
+            [name, first, told.get(first, "force only"), *lasted.get(first, PAPER_TRAINING), *rest]
             for first, *rest in table.rows
         ]
-    return markdown(["scene", headings[0], "is given", "iterations", *headings[1:]], body)
+    shown = ["scene", headings[0], "is given", "iterations", "trained, s", *headings[1:]]
+    return markdown(shown, body)
 
 
-PAPER_ITERATIONS = "100,000"
-"""Iterations of each network of the paper, as it states them."""
+PAPER_TRAINING = ("100,000", DASH)
+"""Iterations of each network of the paper, as it states them, and the seconds."""
 
 
-def _iterations(row: Row) -> str:
-    """Return the iterations of a training; a dash for a method without one."""
-    return DASH if row.training is None else f"{row.training.iterations:,}"
+def _training(row: Row) -> tuple[str, str]:
+    """Return the iterations and the seconds of a training; dashes for a method without one."""
+    if row.training is None:
+        return DASH, DASH
+    fit_s = row.offline_s.fit if row.offline_s else None
+    return f"{row.training.iterations:,}", DASH if fit_s is None else f"{fit_s:.0f}"
 
 
 def facts(source: str, dataset: str = "") -> str:

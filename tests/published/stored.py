@@ -57,7 +57,8 @@ def look_up(content: Any, key: str) -> Any:
     """Follow a key such as ``rows/label=pod [n_modes=20]/error/rel_l2_median``.
 
     A part is a name, the number of an item, or conditions ``name=value`` joined by ``&``. These
-    select the only item of a list that meets them. In a text, the key is a part of it, with ``{}``
+    select the only item of a list that meets them; ``*training`` selects all items with a value of
+    that name, for `reduce`. In a text, the key is a part of it, with ``{}``
     for the number.
 
     Raises
@@ -68,7 +69,11 @@ def look_up(content: Any, key: str) -> Any:
     if isinstance(content, str):
         return _number_in(content, key)
     found = content
-    for part in key.split("/"):
+    parts = key.split("/")
+    for i, part in enumerate(parts):
+        if isinstance(found, list) and part.startswith("*"):
+            rest = "/".join(parts[i + 1 :])
+            return [look_up(item, rest) for item in found if item.get(part[1:]) is not None]
         if isinstance(found, dict) and part in found:
             found = found[part]
         elif isinstance(found, list) and part.isdecimal() and int(part) < len(found):
