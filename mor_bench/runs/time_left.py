@@ -30,8 +30,8 @@ MOST_CORRECTION = 5.0
 MEASURED: tuple[StageName, ...] = ("timing",)
 """Stages whose share of what is done comes from measured durations of their parts."""
 
-APART: tuple[StageName, ...] = ("timing", "report")
-"""Stages whose pace does not follow from that of others."""
+NO_FASTER: tuple[StageName, ...] = ("timing", "report")
+"""Stages that others can show to be slower than planned, but not faster."""
 
 FITTED: tuple[StageName, ...] = ("fit", "other seeds", "learning curve")
 """Stages of fits."""
@@ -134,11 +134,11 @@ class TimeLeft:
     def _pace(self, stage: StageName) -> float:
         """Return measured over planned seconds of the stage, or of all but fits at first.
 
-        The turns of the timing have given seconds on every machine, and the plan of the report has
-        this machine's speed already: compilation and data say nothing about them.
+        A machine under load is slow throughout. But a fast compilation does not make the timing
+        faster, whose turns have given seconds, or the report, whose plan has the machine's speed.
         """
-        others = [task for task in self.spent if task.stage not in FITTED]
-        common = 1.0 if stage in APART else self._ratio(others, 1.0)
+        common = self._ratio([task for task in self.spent if task.stage not in FITTED], 1.0)
+        common = max(common, 1.0) if stage in NO_FASTER else common
         pace = self._ratio([task for task in self.spent if task.stage == stage], common)
         return min(max(pace, 1 / MOST_CORRECTION), MOST_CORRECTION)
 

@@ -169,9 +169,9 @@ def other_choices() -> list[Variant]:
         parameters = {"n_clusters": n, "n_modes": 10}
         variants.append(Variant("others", "local-pod: clusters", str(n), "local-pod", parameters))
     for n_modes, name in product((20, 40), ("euclidean", "stiffness")):
-        parameters = {"n_modes": n_modes, "inner_product": name}
+        given: Parameters = {"n_modes": n_modes, "inner_product": name}
         choice = f"pod, {n_modes} modes: inner product"
-        variants.append(Variant("others", choice, name, "pod", parameters))
+        variants.append(Variant("others", choice, name, "pod", given))
     return variants
 
 
