@@ -162,7 +162,7 @@ def test_a_basis_has_at_most_the_rank_of_its_snapshots(
         "r above the rank": (snapshots[:6], 6),
     }[kind]
     product = stiffness if weighted else None
-    said = f"20 modes were requested, but the {len(chosen)} snapshots have rank {rank}"
+    said = f"20 modes were requested, but the {len(chosen)} samples have rank {rank}"
     with pytest.warns(RankDeficientWarning, match=said):
         modes = pod(chosen, 20, inner_product=product).modes
     assert modes.shape[1] == rank

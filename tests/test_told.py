@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mor_bench.analysis.told import told_at_most
+from mor_bench.analysis.told import given_by, told_at_most
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.entries import by_group, entries_of
 from mor_bench.report.text_table import TextTable, with_information
@@ -126,3 +126,21 @@ def test_tables_of_configurations_and_methods_state_the_class(tmp_path: Path) ->
     ]
     other = TextTable("t", "n", ["load", "x"], [["pod", "1"]])
     assert with_information(other, entries) == other
+
+
+@pytest.mark.parametrize(
+    ("dataset", "given"),
+    [
+        ("beam-tiny", "force"),
+        ("soft-arm", "force"),
+        ("liver-hex-observed", "observed displacements"),
+        ("liver-grasped", "prescribed displacements"),
+        ("liver-pressed", "displacement of the instrument"),
+    ],
+)
+def test_the_input_is_named_by_what_the_dataset_gives(
+    dataset: str, given: str, tmp_path: Path
+) -> None:
+    spec = load_dataset_spec(dataset).model_dump(mode="json")
+    comparison = Comparison(tmp_path, {}, [], datasets={dataset: spec})
+    assert given_by(comparison, dataset) == given

@@ -23,7 +23,7 @@ from mor_bench.analysis.draws import Draws, Interval, answers_all, error_high
 from mor_bench.analysis.frontier import median_latency_ms, number_or_inf
 from mor_bench.analysis.latency_intervals import verdict_of
 from mor_bench.analysis.selection_text import worded
-from mor_bench.analysis.told import classes_of, is_observed
+from mor_bench.analysis.told import classes_of, given_by
 from mor_bench.analysis.verdict import Figures, Relaxation, Requirements, Verdict, speed_rank
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
@@ -61,7 +61,7 @@ def decide(
         },
         figures=figures,
         intervals=draws.intervals,
-        observed=is_observed(comparison, dataset),
+        given=given_by(comparison, dataset),
         run=comparison.out,
         machine=comparison.machine,
         settings=asked_of(comparison, dataset),

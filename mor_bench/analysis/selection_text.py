@@ -168,7 +168,7 @@ def _alternatives(verdict: Verdict, choice: Row) -> list[str]:
         near = verdict.nearest_told.get(told)
         missed = f"none qualifies{f'; the nearest is {_short(near)}' if near else ''}"
         name = missed if best is None else _short(best)
-        lines.append(f"Best when told {told_text(told, verdict.observed)}: {name}.")
+        lines.append(f"Best when told {told_text(told, verdict.given)}: {name}.")
     return lines
 
 
@@ -273,7 +273,7 @@ def _short(row: Row) -> str:
 def evidence(verdict: Verdict, row: Row) -> list[str]:
     """Return the figures of a configuration, one per indented line."""
     lines = [
-        f"  {row.label} ({class_text(row, verdict.observed)})",
+        f"  {row.label} ({class_text(row, verdict.given)})",
         f"    error    {_errors(row.error)} on {row.n_test} test loads",
     ]
     if row.validation:

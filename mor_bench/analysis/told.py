@@ -13,26 +13,25 @@ from mor_bench.specs.method_spec import MethodSpec, Told
 CLASSES: tuple[Told, ...] = get_args(Told)
 """All classes, the one with the least information first."""
 
+FORCE = "force"
+"""Input of most datasets' queries."""
+
 LEGEND = (
-    "What a method is told at query time: the force (or the observed displacements) only; also its "
-    "linear response, which needs the equations once; or the equations. Snapshots: whether it "
-    "learned from samples."
+    "What a method is told at query time: the force (or the displacements of some nodes) only; "
+    "also its linear response, which needs the equations once; or the equations. Snapshots: "
+    "whether it learned from samples."
 )
 
 
-def told_text(told: Told | None, observed: bool) -> str:
-    """Name a class, such as "force and linear response".
-
-    `observed` holds for scenes that give observed displacements instead of forces.
-    """
-    given = "observed displacements" if observed else "force"
+def told_text(told: Told | None, given: str = FORCE) -> str:
+    """Name a class, such as "force and linear response", for the input that `given_by` names."""
     names = {"input": f"{given} only", "linear-response": f"{given} and linear response"}
     return names.get(told or "", told or "not stated")
 
 
-def class_text(row: Row, observed: bool) -> str:
+def class_text(row: Row, given: str) -> str:
     """Describe a row's information, such as "equations, snapshots, reference"."""
-    return class_words(told_text(row.told, observed), row.snapshots, row.reference)
+    return class_words(told_text(row.told, given), row.snapshots, row.reference)
 
 
 def class_words(told: str, snapshots: bool | None, reference: bool) -> str:
@@ -44,14 +43,19 @@ def class_words(told: str, snapshots: bool | None, reference: bool) -> str:
 def class_of_method(spec: MethodSpec, profile: str) -> str:
     """Describe the information of a method of forces with the parameters of its file."""
     told = spec.told_with(spec.parameters_of(profile))
-    return class_words(told_text(told, observed=False), spec.snapshots, spec.reference)
+    return class_words(told_text(told), spec.snapshots, spec.reference)
 
 
-def is_observed(comparison: Comparison, dataset: str) -> bool:
-    """Return whether a dataset gives observed or prescribed displacements instead of forces."""
+def given_by(comparison: Comparison, dataset: str) -> str:
+    """Name the input that a dataset's queries give: the force, or displacements of some nodes."""
     spec = comparison.datasets.get(dataset, {})
-    moved = (spec.get("loads") or {}).get("kind") == "displacement"
-    return moved or bool(spec.get("observed"))
+    if spec.get("observed"):
+        return "observed displacements"
+    kind = (spec.get("loads") or {}).get("kind", "")
+    return {
+        "displacement": "prescribed displacements",
+        "contact": "displacement of the instrument",
+    }.get(kind, FORCE)
 
 
 def classes_of(rows: Iterable[Row]) -> list[Told | None]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from mor_bench.analysis.draws import Interval
 from mor_bench.analysis.frontier import median_latency_ms, number_or_inf, selecting_error
-from mor_bench.analysis.told import classes_of
+from mor_bench.analysis.told import FORCE, classes_of
 from mor_bench.errors import InvalidInputError
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.json_file import without_nan
@@ -120,8 +120,8 @@ class Verdict:
         By label: the upper bounds that the limits are compared with.
     intervals : dict
         By label: the 95 % intervals, see `mor_bench.analysis.draws.Draws`.
-    observed : bool
-        Whether the scene gives observed displacements instead of forces.
+    given : str
+        Input of the dataset's queries in words, see `mor_bench.analysis.told.given_by`.
     run : Path or None
         Folder of the comparison.
     machine, settings : dict
@@ -156,7 +156,7 @@ class Verdict:
     n_without_answers: int = 0
     figures: Figures = field(default_factory=dict)
     intervals: Mapping[str, Mapping[str, Interval]] = field(default_factory=dict)
-    observed: bool = False
+    given: str = FORCE
     run: Path | None = None
     machine: Mapping[str, Any] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)

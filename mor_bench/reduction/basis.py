@@ -239,7 +239,7 @@ class _Decomposition:
         wanted = self.n_modes_of(energy_tolerance) if energy_tolerance is not None else n_modes
         if wanted is not None and wanted > self.rank:
             warnings.warn(
-                f"{wanted} modes were requested, but the {self.n_samples} snapshots have "
+                f"{wanted} modes were requested, but the {self.n_samples} samples have "
                 f"rank {self.rank}: {self.rank} modes are used.",
                 RankDeficientWarning,
                 stacklevel=3,

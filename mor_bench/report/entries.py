@@ -17,7 +17,7 @@ from mor_bench.analysis.frontier import (
     number_or_inf,
     selecting_error,
 )
-from mor_bench.analysis.told import CLASSES, class_text, is_observed
+from mor_bench.analysis.told import CLASSES, class_text, given_by
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 
@@ -152,7 +152,7 @@ def entries_of(
     ]
     front = {point.label for point in non_dominated(points)}
     qualified = verdict_of(analysis or {}, dataset).get("qualified", ())
-    groups = _groups(rows, is_observed(comparison, dataset))
+    groups = _groups(rows, given_by(comparison, dataset))
     records = (analysis or {}).get("rows", ())
     mine = {r["label"]: r for r in records if r["dataset"] == dataset}
     intervals = {label: _intervals(record) for label, record in mine.items()}
@@ -180,13 +180,11 @@ def verdict_of(analysis: Analysis, dataset: str) -> Mapping[str, Any]:
     return next(found, {})
 
 
-def _groups(rows: Sequence[Row], observed: bool) -> dict[str, str]:
+def _groups(rows: Sequence[Row], given: str) -> dict[str, str]:
     """Describe each row's information; a row without a fit has the snapshots of its method."""
     known = {row.method: row.snapshots for row in rows if row.snapshots is not None}
     return {
-        row.label: class_text(
-            row.with_parts(snapshots=known.get(row.method, row.snapshots)), observed
-        )
+        row.label: class_text(row.with_parts(snapshots=known.get(row.method, row.snapshots)), given)
         for row in rows
     }
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mor_bench.analysis.told import classes_of, is_observed, told_text
+from mor_bench.analysis.told import classes_of, given_by, told_text
 from mor_bench.report.canvas import (
     GREY,
     INK,
@@ -112,7 +112,7 @@ def error_over_position(
         centres, regions = np.asarray(arrays["patch_centres"]), np.asarray(arrays["test_regions"])
     except (OSError, KeyError):
         return None
-    maps, observed = [], is_observed(comparison, dataset)
+    maps, given = [], given_by(comparison, dataset)
     entries = entries_of(comparison, dataset, analysis)
     names = short_names([e.row for e in entries])
     for entry in _best_of_each_class(entries):
@@ -121,7 +121,7 @@ def error_over_position(
         except (OSError, KeyError):
             continue
         errors = median_per_patch(relative, regions, len(centres))
-        told = told_text(entry.row.told, observed)
+        told = told_text(entry.row.told, given)
         maps.append(PatchErrors(entry, told, errors, str(names[entry.label])))
     finite = np.concatenate([np.zeros(0), *(found.finite for found in maps)])
     if not len(finite):

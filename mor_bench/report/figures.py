@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 from matplotlib.text import Text
 
-from mor_bench.analysis.told import classes_of, is_observed, told_text
+from mor_bench.analysis.told import classes_of, given_by, told_text
 from mor_bench.report.canvas import Drawn, Picture, add_note, save
 from mor_bench.report.distribution_figure import error_distribution
 from mor_bench.report.entries import Analysis, dataset_names
@@ -61,12 +61,12 @@ def explain_names(picture: Picture, comparison: Comparison, dataset: str) -> Non
 
 def _told(rows: Sequence[Row], shown: str, comparison: Comparison, dataset: str) -> str:
     """Name the methods of a picture by what they are told at query time."""
-    observed, parts = is_observed(comparison, dataset), []
+    given, parts = given_by(comparison, dataset), []
     for told in classes_of(rows):
         methods = dict.fromkeys(row.method for row in rows if row.told == told)
         named = [m for m in methods if re.search(rf"(?<![\w-]){re.escape(m)}(?![\w-])", shown)]
         if told and named:
-            parts.append(f"{told_text(told, observed)} ({', '.join(named)})")
+            parts.append(f"{told_text(told, given)} ({', '.join(named)})")
     return f"Told: {'; '.join(parts)}" if parts else ""
 
 

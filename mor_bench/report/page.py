@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.analysis.told import LEGEND, classes_of, is_observed, told_text
+from mor_bench.analysis.told import FORCE, LEGEND, classes_of, given_by, told_text
 from mor_bench.hard_cases.suite import StressResults
 from mor_bench.report.canvas import Drawn
 from mor_bench.report.details import overall
@@ -186,7 +186,8 @@ def _write(path: Path, view: View, frame: Frame) -> Path:
     comparison = view.comparison
     names = dataset_names(comparison)
     sections = [section_of(view, name) for name in names]
-    observed = all(is_observed(comparison, name) for name in names)
+    inputs = {given_by(comparison, name) for name in names}
+    given = inputs.pop() if len(inputs) == 1 else FORCE
     methods = [view.method] if view.method else [row.method for row in comparison.rows]
     hard = stress_table(frame.stressed, list(dict.fromkeys(methods))) if frame.stressed else None
     page = (
@@ -199,7 +200,7 @@ def _write(path: Path, view: View, frame: Frame) -> Path:
             overall=[] if view.method else with_content(overall(view.analysis)),
             machine=machine_facts(comparison.machine),
             n_resamples=whole(view.analysis["settings"]["n_resamples"]),
-            told={told or "": told_text(told, observed) for told in classes_of(comparison.rows)},
+            told={told or "": told_text(told, given) for told in classes_of(comparison.rows)},
             legend=LEGEND,
             AGAIN=AGAIN,
             data=embedded_json([section.data for section in sections]),

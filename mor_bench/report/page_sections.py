@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mor_bench.analysis.told import is_observed
+from mor_bench.analysis.told import FORCE, given_by
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.canvas import Drawn
 from mor_bench.report.details import dataset_details, hard_cases
@@ -126,6 +126,7 @@ def section_of(view: View, dataset: str) -> Section:
     entries = entries_of(comparison, dataset, analysis)
     rows = [entry.row for entry in entries]
     named, needs = view.names[dataset], needs_of(comparison, dataset)
+    given = given_by(comparison, dataset)
     names = {label: str(name) for label, name in named.items()}
     verdict = _card(view, dataset, entries, names)
     untested = untested_of(analysis, entries)
@@ -148,7 +149,7 @@ def section_of(view: View, dataset: str) -> Section:
         ),
         limits=limits_of(comparison, analysis, entries),
         card=verdict,
-        given="observed displacements" if is_observed(comparison, dataset) else "nodal forces (N)",
+        given="nodal forces (N)" if given == FORCE else f"the {given} (m)",
         needs=needs_in_words(needs),
         frontier=frontier(data, _frontier_title(verdict)),
         charts=charts(data),

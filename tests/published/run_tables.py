@@ -9,7 +9,7 @@ from typing import Any
 from mor_bench.analysis.break_even import FULL_ORDER, break_even
 from mor_bench.analysis.frontier import median_error, median_latency_ms, number_or_inf
 from mor_bench.analysis.selection_text import CHANCE_S
-from mor_bench.analysis.told import class_text, is_observed
+from mor_bench.analysis.told import class_text, given_by
 from mor_bench.report.entries import entries_of
 from mor_bench.report.number_format import DASH, number, percent, short_swept
 from mor_bench.report.paper_tables import against_the_paper
@@ -164,7 +164,7 @@ def selected(source: str, dataset: str = "", methods: str = "", by: str = "need"
         [
             [
                 f"`{row.method}`",
-                class_text(row, is_observed(run, name)),
+                class_text(row, given_by(run, name)),
                 _configuration(row),
                 *_errors(run, row),
                 _percent(row.hidden.rel_l2_median) if row.hidden else DASH,
@@ -184,7 +184,7 @@ def best_of_class(source: str, dataset: str = "") -> str:
     need = float((run.datasets[name].get("needs") or {}).get("error", 0.01))
     bounds, by_class = error_bounds(run, name), dict[str, list[Row]]()
     for row in _rows(run, name, ""):
-        by_class.setdefault(class_text(row, is_observed(run, name)), []).append(row)
+        by_class.setdefault(class_text(row, given_by(run, name)), []).append(row)
     body = []
     for told, rows in by_class.items():
         best = sufficient(rows, bounds, need)
@@ -207,7 +207,7 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     headings = ["method", "is given", *(f"≤ {number(100 * level)} %" for level in LEVELS)]
     body, bounds = [], error_bounds(run, name)
     for method, rows in _by_method(_rows(run, dataset, methods)).items():
-        cells = [f"`{method}`", class_text(rows[0], is_observed(run, name))]
+        cells = [f"`{method}`", class_text(rows[0], given_by(run, name))]
         for level in LEVELS:
             best = sufficient(rows, bounds, level)
             missed = best is not None and median_error(best) > level
@@ -244,7 +244,7 @@ def indicated(source: str, methods: str = "") -> str:
         columns.append({method: chosen(own, bounds) for method, own in mine.items()})
     body = []
     for method in columns[0]:
-        cells = [f"`{method}`", class_text(columns[0][method], is_observed(runs[0], names[0]))]
+        cells = [f"`{method}`", class_text(columns[0][method], given_by(runs[0], names[0]))]
         for column in columns:
             found = column[method].indicator if method in column else None
             if found is None:
@@ -277,7 +277,7 @@ def paper(source: str, methods: str = "") -> str:
         if table is None:
             raise EvidenceError(f"{source}: {name} is no scene of the paper, or nothing ran.")
         headings = table.headings
-        told = {e.label: class_text(e.row, is_observed(run, name)) for e in entries}
+        told = {e.label: class_text(e.row, given_by(run, name)) for e in entries}
         lasted = {e.label: _training(e.row) for e in entries}
         body += [
             [name, first, told.get(first, "force only"), *lasted.get(first, PAPER_TRAINING), *rest]
