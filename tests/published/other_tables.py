@@ -22,6 +22,7 @@ from tests.published.cost_tables import (
     scaling,
 )
 from tests.published.literature_table import literature
+from tests.published.network_size_tables import network_size_law, network_sizes
 from tests.published.projection_tables import projections, reconstructions
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
@@ -345,6 +346,8 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "random-loads": random_loads,
     "choices": choices,
     "choices-decided": choices_decided,
+    "network-sizes": network_sizes,
+    "network-size-law": network_size_law,
     "paper-amplitude": paper_amplitude,
     "records": records,
     "optimism": optimism,
