@@ -23,7 +23,7 @@ from tests.verification.laws_and_elements import (
     manufactured_error,
 )
 
-SIZES = {"quadratic tetrahedron": (2, 3, 4)}
+SIZES = {"quadratic tetrahedron": (2, 3, 4), "tetrahedron": (4, 6, 8, 12, 16)}
 USUAL_SIZES = (4, 6, 8)
 
 
@@ -38,6 +38,9 @@ def draw(path: Path) -> None:
         name = f"{element}{', selective' if selective else ''}: order {order:.2f}"
         left.loglog(h, errors, "o-", label=name)
     left.set(xlabel="size of a cell", ylabel="L2 error of a manufactured solution")
+    left.set_ylim(top=5.0 * left.get_ylim()[1])
+    left.xaxis.set_minor_formatter(plt.NullFormatter())
+    left.set_xticks([0.0625, 0.125, 0.25, 0.5], ["1/16", "1/8", "1/4", "1/2"])
     _taylor(right)
     for axes in (left, right):
         axes.legend(frameon=False, fontsize=8)
