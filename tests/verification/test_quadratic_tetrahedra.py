@@ -18,6 +18,7 @@ from mor_bench.scene.interpolation import interpolation_matrix, quadratic
 from mor_bench.scene.loads import Facets, cut_patches
 from mor_bench.scene.mesh import Mesh, box_mesh, corners_of
 from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.scene.second_order import with_middles
 from mor_bench.scene.triangle_rules import (
     DEGREE_2,
     DEGREE_4,
@@ -165,11 +166,21 @@ def test_facets_are_drawn_as_four_triangles_that_face_outwards() -> None:
 
 def test_points_in_curved_cells_are_found() -> None:
     straight = box()
-    mesh = Mesh(bent(straight.points), straight.cells)
-    at = np.random.default_rng(0).dirichlet(np.ones(4), len(mesh.cells))[:, 1:]
+    x, y, z = straight.points.T
+    # The middles of the first cells' edges along y lie beyond the boxes around the corners.
+    mesh = Mesh(np.stack([x + 0.2 * y * (0.5 - y), y, z], axis=1), straight.cells)
+    cells = np.repeat(mesh.cells, 10, axis=0)
+    at = np.random.default_rng(0).dirichlet(np.full(4, 0.3), len(cells))[:, 1:]
     shape = quadratic(at)[0]
-    points = np.einsum("ca,cai->ci", shape, mesh.points[mesh.cells])
+    points = np.einsum("ca,cai->ci", shape, mesh.points[cells])
     # At rest the same places hold the values of the map, which is quadratic.
-    at_rest = np.einsum("ca,cai->ci", shape, straight.points[mesh.cells])
+    at_rest = np.einsum("ca,cai->ci", shape, straight.points[cells])
     weights = interpolation_matrix(mesh, points)
     np.testing.assert_allclose(weights @ straight.points, at_rest, atol=1e-11)
+
+
+def test_sets_gain_the_middles_between_their_nodes_alone() -> None:
+    linear = box_mesh((2.0, 1.0, 1.0), (4, 2, 2), tetrahedra=True)
+    end = np.flatnonzero(linear.points[:, 0] == 0.0)
+    mesh, sets = with_middles(linear, {"end": end})
+    np.testing.assert_array_equal(sets["end"], np.flatnonzero(mesh.points[:, 0] == 0.0))
