@@ -12,12 +12,8 @@ from numpy.typing import NDArray
 from mor_bench.counting import Cost, counted
 from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.hard_cases.setups import LAW
-from mor_bench.mechanics.assembly import (
-    Assembler,
-    Discretisation,
-    discretisation_of,
-    quadrature_of,
-)
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.discretisation import Discretisation, discretisation_of, quadrature_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.hard_cases.setups import LAW
-from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.mechanics.newton import Solution
 from mor_bench.mechanics.stability import LimitPoint, limit_load
 from mor_bench.reduction.basis import Basis, pod

@@ -14,7 +14,8 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.scene.mesh import box_mesh
 from tests.verification.laws_and_elements import (
     COMPRESSIBLE,

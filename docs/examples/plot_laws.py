@@ -9,7 +9,8 @@ limit point there.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.scene.materials import Corotational, NeoHookean, SaintVenantKirchhoff
 from mor_bench.scene.mesh import box_mesh
 

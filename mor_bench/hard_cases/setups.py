@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.banded import BandedCholesky
+from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.galerkin import GalerkinProblem

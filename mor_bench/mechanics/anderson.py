@@ -17,53 +17,93 @@ WINDOW = 5
 """Number of differences that are kept."""
 
 
+NOISE = 1e-12
+"""Squared sine of the angle to the span of other changes below which a change adds only noise."""
+
+CHUNK = 2048
+"""Entries of a vector that are read together, so that they stay in the cache."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _least_squares(gram, along):
+    """Return c of least |ΔG c - g|, from ΔGᵀΔG and ΔGᵀg, by a Cholesky factor with pivoting.
+
+    Columns are scaled to length one, since they shrink as the iteration converges.
+    """
+    held = len(along)
+    scale, c = np.zeros(held), np.zeros(held)
+    left, rest = np.zeros((held, held)), np.empty((held, held))
+    for i in range(held):
+        scale[i] = 1.0 / np.sqrt(gram[i, i]) if gram[i, i] > 0.0 else 0.0
+    for i in range(held):
+        for j in range(held):
+            rest[i, j] = gram[i, j] * scale[i] * scale[j]
+    order, rank, y = np.zeros(held, np.int64), 0, along * scale
+    for _ in range(held):
+        pivot = 0
+        for i in range(held):
+            if rest[i, i] > rest[pivot, pivot]:
+                pivot = i
+        if not rest[pivot, pivot] > NOISE:
+            break
+        root = np.sqrt(rest[pivot, pivot])
+        order[rank] = pivot
+        for i in range(held):
+            left[i, rank] = rest[i, pivot] / root
+        for i in range(held):
+            for j in range(held):
+                rest[i, j] -= left[i, rank] * left[j, rank]
+        rest[pivot, :] = 0.0
+        rest[:, pivot] = 0.0
+        rank += 1
+    for a in range(rank):
+        for b in range(a):
+            y[order[a]] -= left[order[a], b] * y[order[b]]
+        y[order[a]] /= left[order[a], a]
+    for a in range(rank - 1, -1, -1):
+        c[order[a]] = y[order[a]]
+        for b in range(a + 1, rank):
+            c[order[a]] -= left[order[b], a] * c[order[b]]
+        c[order[a]] /= left[order[a], a]
+    return c * scale
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
-def _combine(correction, steps, changes, held, basis, out):
+def _combine(correction, steps, changes, held, newest, gram, out):
     """Write g - (ΔQ + ΔG) c to ``out``, with c the least-squares solution of ΔG c = g.
 
-    Modified Gram-Schmidt finds c.
+    ΔQ and ΔG are the first ``held`` columns. Of ``gram``, ΔGᵀΔG, row and column ``newest`` are
+    computed, the others are known.
     """
     n = len(correction)
-    triangle, c = np.zeros((held, held)), np.zeros(held)
-    for j in range(held):
-        before = 0.0
-        for k in range(n):
-            basis[j, k] = changes[j, k]
-            before += changes[j, k] * changes[j, k]
-        for i in range(j):
-            dot = 0.0
-            for k in range(n):
-                dot += basis[i, k] * basis[j, k]
-            triangle[i, j] = dot
-            for k in range(n):
-                basis[j, k] -= dot * basis[i, k]
-        after = 0.0
-        for k in range(n):
-            after += basis[j, k] * basis[j, k]
-        triangle[j, j] = np.sqrt(after)
-        # A change within the span of the others adds nothing but noise.
-        inverse = 1.0 / np.sqrt(after) if after > 1e-16 * before else 0.0
-        dot = 0.0
-        for k in range(n):
-            basis[j, k] *= inverse
-            dot += basis[j, k] * correction[k]
-        c[j] = dot
-    for j in range(held - 1, -1, -1):
-        for i in range(j + 1, held):
-            c[j] -= triangle[j, i] * c[i]
-        c[j] = c[j] / triangle[j, j] if triangle[j, j] > 0.0 else 0.0
-    for k in range(n):
-        s = correction[k]
+    dots, along = np.zeros(held), np.zeros(held)
+    for start in range(0, n, CHUNK):
+        stop = min(start + CHUNK, n)
         for j in range(held):
-            s -= c[j] * (steps[j, k] + changes[j, k])
-        out[k] = s
+            dot, share = 0.0, 0.0
+            for k in range(start, stop):
+                dot += changes[j, k] * changes[newest, k]
+                share += changes[j, k] * correction[k]
+            dots[j] += dot
+            along[j] += share
+    for j in range(held):
+        gram[newest, j] = gram[j, newest] = dots[j]
+    c = _least_squares(gram[:held, :held], along)
+    for start in range(0, n, CHUNK):
+        stop = min(start + CHUNK, n)
+        for k in range(start, stop):
+            out[k] = correction[k]
+        for j in range(held):
+            for k in range(start, stop):
+                out[k] -= c[j] * (steps[j, k] + changes[j, k])
 
 
 class Anderson:
     """Memory of the acceleration: the last differences of iterates, corrections and residuals."""
 
     def __init__(self, n: int) -> None:
-        self._steps, self._changes, self._basis = np.empty((3, WINDOW, n))
+        self._steps, self._changes = np.empty((2, WINDOW, n))
+        self._gram = np.zeros((WINDOW, WINDOW))
         self._held = 0
         self._count = 0
         self._last: tuple[Array, Array, Array] | None = None
@@ -76,8 +116,8 @@ class Anderson:
 
     def advance(self, q: Array, correction: Array, residual: Array) -> Array:
         """Return the step from q, given the correction P⁻¹r and the residual r there."""
+        slot = self._count % WINDOW
         if self._last is not None:
-            slot = self._count % WINDOW
             q_before, correction_before, residual_before = self._last
             np.subtract(q, q_before, out=self._steps[slot])
             np.subtract(correction, correction_before, out=self._changes[slot])
@@ -85,7 +125,8 @@ class Anderson:
             self._count += 1
             self._held = min(self._count, WINDOW)
         self._last = q, correction, residual
-        count(multiply_adds=len(q) * (self._held * (self._held + 4) + (self._held > 0)))
+        held = self._held
+        count(multiply_adds=len(q) * (4 * held + (held > 0)))
         step = np.empty_like(q)
-        _combine(correction, self._steps, self._changes, self._held, self._basis, step)
+        _combine(correction, self._steps, self._changes, held, slot, self._gram, step)
         return step

@@ -11,8 +11,13 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.counting import count, is_counting
-from mor_bench.errors import UnsupportedSceneError
-from mor_bench.mechanics.elements import H8, element_of, shape_gradients
+from mor_bench.mechanics.discretisation import (
+    Discretisation,
+    distinct,
+    law_parameters,
+    quadrature_of,
+)
+from mor_bench.mechanics.elements import H8
 from mor_bench.mechanics.kernels import (
     ADVANCE_MULTIPLY_ADDS,
     FORCE_MULTIPLY_ADDS,
@@ -27,10 +32,8 @@ from mor_bench.mechanics.kernels import (
 from mor_bench.mechanics.laws import general_force, general_multiply_adds
 from mor_bench.mechanics.pattern import Pattern, build_pattern
 from mor_bench.mechanics.turned import TurnedDofs
-from mor_bench.scene.materials import Material, SaintVenantKirchhoff
-from mor_bench.scene.scene import Scene
+from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.supports import Frames
-from mor_bench.specs import NO_EQUATIONS
 
 Array = NDArray[np.float64]
 
@@ -52,108 +55,6 @@ def _batched(values: NDArray[Any], fill: float) -> NDArray[Any]:
     return np.ascontiguousarray(
         np.moveaxis(padded.reshape(n_batches, LANES, *values.shape[1:]), 1, -1)
     )
-
-
-@dataclass(frozen=True)
-class Discretisation:
-    """Cells of a mesh, their material and how they are integrated.
-
-    Attributes
-    ----------
-    points : (n_nodes, 3) float64
-        Reference positions, m.
-    cells : (n_cells, 8), (n_cells, 4) or (n_cells, 10) int
-        Nodes of the H8, T4 or T10 cells to sum over.
-    material : Material
-    selective : bool
-        Whether the volumetric energy is integrated with mean gradients, which cures volumetric
-        locking of H8.
-    springs : (n_dofs, n_dofs) sparse float64, optional
-        Stiffness of springs on the surface, N/m.
-    rest : (n_nodes, 3) float64, optional
-        Displacements of a rest state under a constant pre-load, m. Displacements and forces are
-        then measured from it.
-    """
-
-    points: Array
-    cells: NDArray[np.int64]
-    material: Material
-    selective: bool = False
-    springs: sp.csr_array | None = None
-    rest: Array | None = None
-
-
-def discretisation_of(
-    scene: Scene, chosen: NDArray[np.int64] | slice = slice(None)
-) -> Discretisation:
-    """Return the discretisation of all cells of a scene, or of the chosen ones.
-
-    Raises
-    ------
-    UnsupportedSceneError
-        If the scene's snapshots were imported, so that its equations are unknown.
-    """
-    if scene.material is None:
-        raise UnsupportedSceneError(f"{scene.name}: {NO_EQUATIONS}.")
-    mesh = scene.mesh
-    return Discretisation(
-        mesh.points, mesh.cells[chosen], scene.material, scene.selective, scene.spring_matrix
-    )
-
-
-def body_force(body: Discretisation, density: Array) -> Array:
-    """Return the nodal forces (n_nodes, 3), N, of a uniform force density (3,), N/m³."""
-    element = element_of(body.cells)
-    det_j = shape_gradients(body.points, body.cells, element.derivatives)[1]
-    shares = (det_j * element.weights) @ element.values
-    volumes = np.bincount(body.cells.ravel(), shares.ravel(), len(body.points))
-    return np.asarray(volumes[:, None] * density)
-
-
-@dataclass(frozen=True)
-class Quadrature:
-    """Gradients, weights and law parameters at the quadrature points of every cell.
-
-    Attributes
-    ----------
-    gradients : (n_cells, n_points, n_nodes, 3) float64
-    weights : (n_cells, n_points) float64
-    parameters : (n_points, n_parameters) float64
-    """
-
-    gradients: Array
-    weights: Array
-    parameters: Array
-
-
-def quadrature_of(body: Discretisation) -> Quadrature:
-    """Return the quadrature of all cells, with full or selective integration.
-
-    Selective integration takes the volumetric part from each cell's mean gradient, the rest at
-    every point (B-bar: Hughes, IJNME 15, 1980). The energy is a sum of both parts, so the tangent
-    stays symmetric. The pressure is constant in a cell and may oscillate between cells.
-    """
-    element = element_of(body.cells)
-    gradients, det_j = shape_gradients(body.points, body.cells, element.derivatives)
-    weights = det_j * element.weights
-    if not body.selective:
-        return Quadrature(gradients, weights, law_parameters(body))
-    # The gradient at the centre instead of the mean fails the patch test on warped cells.
-    volume = weights.sum(axis=1)
-    mean = np.einsum("cq,cqaj->caj", weights, gradients) / volume[:, None, None]
-    return Quadrature(
-        np.concatenate([gradients, mean[:, None]], axis=1),
-        np.hstack([weights, volume[:, None]]),
-        law_parameters(body),
-    )
-
-
-def law_parameters(body: Discretisation) -> Array:
-    """Return the law's parameters (n_points, n_parameters) at the quadrature points of a cell."""
-    material, n = body.material, len(element_of(body.cells).weights)
-    if body.selective:
-        return np.array([material.shape_parameters] * n + [material.volume_parameters])
-    return np.array([material.parameters] * n)
 
 
 def _placed(
@@ -231,9 +132,8 @@ class Assembler:
         self._dof_of_node, self._own, self._frames = dof_of_node, own, frames
         self._dofs = _batched(dofs.astype(np.int32), self._n_summed)
         self._slots = _batched(slots, len(self.summed_pattern.indices))
-        self._gradients = _batched(
-            quadrature.gradients.reshape(n_cells, n_points, 3 * n_nodes), 0.0
-        ).reshape(-1, n_points, 3 * n_nodes * LANES)
+        gradients = distinct(quadrature.gradients.reshape(n_cells, n_points, 3 * n_nodes), LANES)
+        self._gradients = _batched(gradients, 0.0).reshape(-1, n_points, 3 * n_nodes * LANES)
         self._rule = quadrature.weights
         if cell_weights is not None:
             self._rule = quadrature.weights * cell_weights[:, None]

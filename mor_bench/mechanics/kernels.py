@@ -235,8 +235,9 @@ def internal_force(u, dofs, gradients, w_lam, w_mu, force):
     u : (n_dofs + 1,) float64
         Displacements, m; the last entry, of the dummy dof, is zero.
     dofs : (n_batches, 24, LANES) int32
-    gradients : (n_batches, n_points, 24 * LANES) float64
-        dN_a/dX_j at the Gauss points, entry (3a + j) * LANES + lane, 1/m.
+    gradients : (n, n_points, 24 * LANES) float64
+        dN_a/dX_j at the Gauss points, entry (3a + j) * LANES + lane, 1/m. Batch b has those of
+        b mod n.
     w_lam, w_mu : (n_batches, n_points, LANES) float64
         Gauss weight times det J (and a cubature weight) times λ and times μ, J. With selective
         integration a point carries only one of the two.
@@ -252,12 +253,13 @@ def internal_force(u, dofs, gradients, w_lam, w_mu, force):
     H, S = np.empty(9 * LANES), np.empty(6 * LANES)
     energy, min_det = np.zeros(LANES), np.full(LANES, np.inf)
     for b in range(dofs.shape[0]):
+        own = gradients[b % gradients.shape[0]]
         for i in range(24):
             for l in range(LANES):
                 u_e[i * LANES + l] = u[dofs[b, i, l]]
         f_e[:] = 0.0
         for q in range(gradients.shape[1]):
-            _point(u_e, gradients[b, q], w_lam[b, q], w_mu[b, q], H, S, f_e, energy, min_det)
+            _point(u_e, own[q], w_lam[b, q], w_mu[b, q], H, S, f_e, energy, min_det)
         for i in range(24):
             for l in range(LANES):
                 force[dofs[b, i, l]] += f_e[i * LANES + l]
@@ -282,13 +284,14 @@ def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, va
     h_mu, t = np.empty(24 * LANES), np.empty(24 * LANES)
     energy, min_det = np.zeros(LANES), np.full(LANES, np.inf)
     for b in range(dofs.shape[0]):
+        own = gradients[b % gradients.shape[0]]
         for i in range(24):
             for l in range(LANES):
                 u_e[i * LANES + l] = u[dofs[b, i, l]]
         f_e[:] = 0.0
         k_e[:] = 0.0
         for q in range(gradients.shape[1]):
-            g = gradients[b, q]
+            g = own[q]
             _point(u_e, g, w_lam[b, q], w_mu[b, q], H, S, f_e, energy, min_det)
             _push_forward(H, S, g, w_lam[b, q], w_mu[b, q], h, h_lam, h_mu, t, M)
             _add_blocks(g, h, h_lam, h_mu, t, M, k_e)

@@ -925,8 +925,8 @@ def general_force(law: int, n_nodes: int):
     u : (n_dofs + 1,) float64
         Displacements, m; the last entry, of the dummy dof, is zero.
     dofs : (n_batches, 3 n_nodes, LANES) int32
-    gradients : (n_batches, n_points, 3 n_nodes * LANES) float64
-        dN_a/dX_j at entry (3a + j) * LANES + lane, 1/m.
+    gradients : (n, n_points, 3 n_nodes * LANES) float64
+        dN_a/dX_j at entry (3a + j) * LANES + lane, 1/m. Batch b has those of b mod n.
     weights : (n_batches, n_points, LANES) float64
         Quadrature weight times det J, m³; zero for padding.
     parameters : (n_points, n_parameters * LANES) float64
@@ -962,7 +962,7 @@ def general_force(law: int, n_nodes: int):
             if values is not None:
                 k_e[:] = 0.0
             for q in range(gradients.shape[1]):
-                g = gradients[b, q]
+                g = gradients[b % gradients.shape[0], q]
                 _displacement_gradient(u_e, g, H, n_nodes)
                 _strain(H, weights[b, q], F, totals)
                 if law == SAINT_VENANT_KIRCHHOFF:

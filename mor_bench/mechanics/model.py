@@ -21,14 +21,9 @@ from mor_bench.errors import (
     SpecError,
     UnsupportedSceneError,
 )
-from mor_bench.mechanics.assembly import (
-    Assembler,
-    Discretisation,
-    State,
-    body_force,
-    discretisation_of,
-)
+from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.banded import BandedCholesky, BandedFactor
+from mor_bench.mechanics.discretisation import Discretisation, body_force, discretisation_of
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.linear import (
     Factor,

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import SolverError
 from mor_bench.mechanics.accelerated import accelerated, run_in_step
-from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.mechanics.model import FullOrderModel, body_of
 from mor_bench.mechanics.newton import NewtonOptions, Solution, checked_load
 from mor_bench.mechanics.observed import ObservedModel, generating_model, linear_response

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.errors import InvalidInputError, UnsupportedSceneError
-from mor_bench.mechanics.assembly import Assembler, body_force, discretisation_of
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.discretisation import body_force, discretisation_of
 from mor_bench.mechanics.model import rest_displacement
 from mor_bench.mechanics.pressed import PressedFacets, PressedModel
 from mor_bench.scene.scene import Scene

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.counting import cholesky_multiply_adds, count, triangular_multiply_adds
-from mor_bench.mechanics.assembly import Discretisation, State, law_parameters, quadrature_of
+from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.discretisation import Discretisation, law_parameters, quadrature_of
 from mor_bench.mechanics.laws import SAINT_VENANT_KIRCHHOFF, point_multiply_adds, point_stresses
 from mor_bench.mechanics.newton import HOPELESS, PLAIN_ITERATIONS, Solution
 from mor_bench.mechanics.problem import ROUND_OFF

@@ -28,7 +28,8 @@ from mor_bench.counting import (
     triangular_multiply_adds,
 )
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.assembly import State, discretisation_of, quadrature_of
+from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.discretisation import discretisation_of, quadrature_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.galerkin import DenseProblem

@@ -27,7 +27,8 @@ from rich.table import Table
 from mor_bench.counting import counted
 from mor_bench.hard_cases.setups import of_order
 from mor_bench.machine import describe_machine
-from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.scene.mesh import box_mesh
 from tests.benchmarks.contenders import Array, pin_threads
 from tests.verification.laws_and_elements import ELEMENTS, LAWS, mesh_options

@@ -11,8 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from mor_bench.hard_cases.setups import of_order
-from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.banded import BandedCholesky
+from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.mechanics.elements import T4, shape_gradients
 from mor_bench.scene.interpolation import quadratic, trilinear
 from mor_bench.scene.materials import (

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.hard_cases.setups import material_table
-from mor_bench.mechanics.assembly import Assembler, discretisation_of
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.discretisation import discretisation_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene, load_scene
 

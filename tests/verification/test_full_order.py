@@ -16,9 +16,10 @@ from mor_bench.errors import (
     UnconstrainedBodyError,
 )
 from mor_bench.hard_cases.setups import LAW, dense, distorted_box, free_assembler
-from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.banded import BandedCholesky
 from mor_bench.mechanics.cycles import Cycle, level_of
+from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.mechanics.linear import (
     NotPositiveDefiniteError,
     SparseLU,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.assembly import body_force, discretisation_of
+from mor_bench.mechanics.discretisation import body_force, discretisation_of
 from mor_bench.mechanics.model import rest_displacement
 from mor_bench.mechanics.reactions import Reactions
 from mor_bench.scene.scene import Scene, load_scene

@@ -13,7 +13,8 @@ import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError, UnsupportedSceneError
 from mor_bench.hard_cases.setups import material_table
 from mor_bench.measure.stress_errors import StressErrors
-from mor_bench.mechanics.assembly import Assembler, discretisation_of
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.discretisation import discretisation_of
 from mor_bench.mechanics.model import rest_displacement
 from mor_bench.mechanics.stresses import CellStresses, Stresses
 from mor_bench.report.entries import entries_of
