@@ -24,7 +24,7 @@ CHUNK = 2048
 """Entries of a vector that are read together, so that they stay in the cache."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+@njit(inline="always")
 def _least_squares(gram, along):
     """Return c of least |ΔG c - g|, from ΔGᵀΔG and ΔGᵀg, by a Cholesky factor with pivoting.
 
