@@ -91,6 +91,28 @@ def test_pages_of_an_earlier_report_do_not_stay_old(tmp_path: Path) -> None:
     assert old.read_text() != "old"
 
 
+def test_a_page_that_would_be_too_large_is_brief(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It keeps verdicts, tables and frontiers, and links to the datasets' whole pages."""
+    made = tiny(tmp_path, "one", "two")
+    for name in ("one", "two"):
+        add_row(made, "pod", {}, 0.005, 1.0, dataset=name)
+    analysis = analyse(made)
+    whole = page_of(made, analysis)
+    monkeypatch.setattr("mor_bench.report.page.MOST_BYTES", len(whole.encode()) - 1)
+    brief = page_of(made, analysis)
+    assert "its own page" not in text_of(whole)
+    assert text_of(brief).count("its own page") == 2
+    own = re.findall(r'<a href="(pages/dataset-[^"]*)">its own page', brief)
+    assert [(tmp_path / path).is_file() for path in own] == [True, True]
+    for title in ("Distribution of errors", "Singular values"):
+        assert title in text_of(whole)
+        assert title not in text_of(brief)
+        assert all(title in text_of((tmp_path / path).read_text()) for path in own)
+    assert text_of(brief).count("Take pod") == text_of(whole).count("Take pod") > 1
+
+
 def test_pages_show_the_test_error_of_what_validation_selects(tmp_path: Path) -> None:
     made = tiny(tmp_path)
     add_row(made, "lucky", {"k": 1}, 0.023, 1.0, validation={"rel_l2_median": 0.08})

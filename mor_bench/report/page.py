@@ -25,7 +25,7 @@ from mor_bench.report.number_format import unbroken, whole
 from mor_bench.report.page_facts import AGAIN, machine_facts, method_facts
 from mor_bench.report.page_index import standings
 from mor_bench.report.page_scripts import Assets, beside, embedded_json, inlined
-from mor_bench.report.page_sections import View, section_of
+from mor_bench.report.page_sections import Section, View, section_of
 from mor_bench.report.page_tables import in_python, with_content
 from mor_bench.report.short_names import short_names
 from mor_bench.results.comparison import Comparison
@@ -36,6 +36,9 @@ PAGES = "pages"
 
 STRESS = "stress.json"
 """Name of a file of `mor-bench stress --out` that the report shows."""
+
+MOST_BYTES = 6_000_000
+"""Size of a page from which on its sections are brief, and link to the datasets' own pages."""
 
 BODY_BYTES = 1_800_000
 """Room for the bodies of all datasets, in letters of the page; on a method's page a quarter."""
@@ -113,6 +116,8 @@ def write_page(
     written: list[Path] = []
     if pages or len(datasets) > 1 or (comparison.out / PAGES).is_dir():  # never leave old ones
         written += _write_pages(view, frame)
+        files = _files("dataset", datasets)
+        view = replace(view, pages={name: f"{PAGES}/{file}" for name, file in files.items()})
         frame = replace(frame, links=[(f"{PAGES}/index.html", "A page per dataset and method")])
     path = comparison.out / "report.html"
     _write(path, view, frame)
@@ -156,7 +161,14 @@ def _write_pages(view: View, frame: Frame) -> list[Path]:
             ],
             facts=method_facts(comparison, name),
         )
-        shown = replace(view, comparison=part, analysis=analysis, body_bytes=room, method=name)
+        shown = replace(
+            view,
+            comparison=part,
+            analysis=analysis,
+            body_bytes=room,
+            method=name,
+            pages=files["dataset"],
+        )
         written.append(_write(folder / file, shown, about))
     index = (
         _environment()
@@ -182,15 +194,24 @@ def _files(kind: str, names: Iterable[str]) -> dict[str, str]:
 
 
 def _write(path: Path, view: View, frame: Frame) -> Path:
-    """Write a page with a section per dataset."""
-    comparison = view.comparison
-    names = dataset_names(comparison)
+    """Write a page with a section per dataset, brief ones if it would become too large."""
+    names = dataset_names(view.comparison)
     sections = [section_of(view, name) for name in names]
+    page = _page(view, frame, sections)
+    if len(names) > 1 and view.pages and len(page.encode()) > MOST_BYTES:
+        page = _page(view, frame, [section.brief(view.pages[section.name]) for section in sections])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, page.encode())
+    return path
+
+
+def _page(view: View, frame: Frame, sections: Sequence[Section]) -> str:
+    comparison, names = view.comparison, [section.name for section in sections]
     inputs = {given_by(comparison, name) for name in names}
     given = inputs.pop() if len(inputs) == 1 else FORCE
     methods = [view.method] if view.method else [row.method for row in comparison.rows]
     hard = stress_table(frame.stressed, list(dict.fromkeys(methods))) if frame.stressed else None
-    page = (
+    return (
         _environment()
         .get_template("page.html.j2")
         .render(
@@ -206,9 +227,6 @@ def _write(path: Path, view: View, frame: Frame) -> Path:
             data=embedded_json([section.data for section in sections]),
         )
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, page.encode())
-    return path
 
 
 def _environment() -> Environment:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from mor_bench.analysis.told import FORCE, given_by
@@ -62,7 +62,8 @@ class Section:
     `body_picture` replaces the turning bodies on paper. `worst` describes the worst test loads by
     label, and `faster` is the title of the table of pairs. `protocol` says how all was measured.
     `untested` says, by method, why it is not tested where it is built for.
-    `data` is the content for the scripts.
+    `data` is the content for the scripts. `elsewhere` is the address of the page that has what a
+    brief section leaves out; empty if nothing is left out.
     """
 
     name: str
@@ -92,6 +93,33 @@ class Section:
     faster: str
     protocol: str
     data: dict[str, Any]
+    elsewhere: str = ""
+
+    def brief(self, elsewhere: str) -> Section:
+        """Return only the verdict, the error against time and the table of configurations."""
+        kept = {key: value for key, value in self.data.items() if key not in _CHARTS_ALONE}
+        return replace(
+            self,
+            charts=[],
+            hard=[],
+            details=[],
+            body_picture=None,
+            data=kept,
+            elsewhere=elsewhere,
+        )
+
+
+_CHARTS_ALONE = (
+    "distributions",
+    "deformations",
+    "positions",
+    "singular",
+    "learning",
+    "losses",
+    "costs",
+    "bodies",
+)
+"""Keys of the data that only the charts of a whole section read."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +138,8 @@ class View:
         Room for the bodies of a section, in letters of the page.
     method : str or None
         The method that the page is about; None for all.
+    pages : dict
+        By dataset: the address of its own page.
     """
 
     comparison: Comparison
@@ -118,6 +148,7 @@ class View:
     names: Mapping[str, Mapping[str, ShortName]]
     body_bytes: int
     method: str | None = None
+    pages: Mapping[str, str] = field(default_factory=dict)
 
 
 def section_of(view: View, dataset: str) -> Section:
