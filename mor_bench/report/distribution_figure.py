@@ -105,9 +105,10 @@ def error_distribution(
     subject = f"{dataset}: distribution of errors and latencies, the best configuration per method"
     figure = new_figure(3.6 * (1 + bool(latencies)), finding, subject)
     panels = figure.subplots(1 + bool(latencies), 1, squeeze=False).ravel()
-    draw_distribution(panels[0], errors, needs)
+    dashes = dashes_of([stairs.method for stairs in (*errors, *latencies)])
+    draw_distribution(panels[0], errors, needs, dashes)
     for axes in panels[1:]:
-        _draw(axes, latencies, needs.latency_ms, "ms")
+        _draw(axes, latencies, needs.latency_ms, "ms", dashes)
         axes.set_xlabel("latency of a query, at most (ms)", fontsize=LABEL)
         axes.set_ylabel("queries (%)", fontsize=LABEL)
     return Picture(
@@ -115,14 +116,29 @@ def error_distribution(
     )
 
 
-def draw_distribution(axes: Axes, errors: Sequence[Staircase], needs: Requirements) -> None:
-    """Draw the share of test loads with at most an error, a staircase per method."""
-    _draw(axes, errors, None if needs.error is None else 100 * needs.error, "%")
+def draw_distribution(
+    axes: Axes,
+    errors: Sequence[Staircase],
+    needs: Requirements,
+    dashes: Mapping[str, Dash] | None = None,
+) -> None:
+    """Draw the share of test loads with at most an error, a staircase per method.
+
+    `dashes` are the line styles if other panels show the methods, too.
+    """
+    dashes = dashes or dashes_of([stairs.method for stairs in errors])
+    _draw(axes, errors, None if needs.error is None else 100 * needs.error, "%", dashes)
     axes.set_xlabel("relative L2 error of a test load, at most (%)", fontsize=LABEL)
     axes.set_ylabel("test loads (%)", fontsize=LABEL)
 
 
-def _draw(axes: Axes, found: Sequence[Staircase], need: float | None, unit: str) -> None:
+def _draw(
+    axes: Axes,
+    found: Sequence[Staircase],
+    need: float | None,
+    unit: str,
+    dashes: Mapping[str, Dash],
+) -> None:
     """Draw the staircases, with their names beside them."""
     dress(axes)
     axes.set_xscale("log")
@@ -134,7 +150,6 @@ def _draw(axes: Axes, found: Sequence[Staircase], need: float | None, unit: str)
         axes.axvline(need, color=GREY, linestyle=":", linewidth=1.2, zorder=1)
     log_ticks(axes.xaxis, axes.get_xlim())
     (start, end), notes, lines = axes.get_xlim(), [], []
-    dashes = dashes_of([stairs.method for stairs in found])
     for stairs in found:
         style, x = style_of(stairs.method), stairs.finite
         y = 100 * (np.searchsorted(stairs.values, x, side="right") / len(stairs.values))

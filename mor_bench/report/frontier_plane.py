@@ -125,16 +125,21 @@ def plane_of(shown: Sequence[Entry], needs: Requirements) -> Plane:
     )
 
 
+def lines_of(mine: Sequence[Entry]) -> dict[str, list[Entry]]:
+    """Group a method's configurations by the values of all swept parameters but the first."""
+    varied = varied_keys([e.row for e in mine])[1:]
+    groups: dict[str, list[Entry]] = {}
+    for entry in mine:
+        text = value_text({key: entry.swept.get(key) for key in varied})
+        groups.setdefault(text, []).append(entry)
+    return groups
+
+
 def series_of(shown: Sequence[Entry]) -> list[Series]:
     """Join the configurations of each method that differ in their first swept parameter."""
     found = []
     for method in dict.fromkeys(e.method for e in shown):
-        mine = [e for e in shown if e.method == method]
-        varied = varied_keys([e.row for e in mine])[1:]
-        groups: dict[str, list[Entry]] = {}
-        for entry in mine:
-            text = value_text({key: entry.swept.get(key) for key in varied})
-            groups.setdefault(text, []).append(entry)
+        groups = lines_of([e for e in shown if e.method == method])
         found += [
             Series(shortened(f"{method}, {text}" if text else method, 44), members, LINES[i % 4])
             for i, (text, members) in enumerate(groups.items())

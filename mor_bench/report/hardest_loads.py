@@ -69,6 +69,9 @@ def _shared(found: Sequence[Sampled], arrays: Mapping[str, NDArray[Any]]) -> lis
     np.put_along_axis(ranks, order, np.arange(n_loads)[None, :].repeat(n_methods, axis=0), axis=1)
     counts = (ranks < ceil(HARD_SHARE * n_loads)).sum(axis=0)
     chosen = np.lexsort((np.median(ranks, axis=0), -counts))[:N_SHARED]
+    chosen = chosen[counts[chosen] > n_methods / 2]
+    if not len(chosen):
+        return []
     rows = [
         [
             str(load),

@@ -11,6 +11,7 @@ import numpy as np
 
 from mor_bench.analysis.verdict import Requirements, needs_of
 from mor_bench.report.entries import Analysis, Entry, by_group
+from mor_bench.report.frontier_plane import lines_of
 from mor_bench.report.method_styles import DARK, readable, style_of
 from mor_bench.report.number_format import number, percent, span
 from mor_bench.report.page_bodies import bodies
@@ -70,6 +71,7 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
         "styles": {entry.method: _style(entry.method) for entry in entries},
         "groups": list(by_group(entries)),
         "rows": [_row(shown, entry, needs) for entry in entries],
+        "lines": _lines(entries),
         "order": [entry.label for entry in sorted(entries, key=reading_order)],
         "distributions": distributions(found),
         "deformations": deformations(compared),
@@ -81,6 +83,16 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
         "costs": _costs(shown),
         "bodies": bodies(found, mesh, body_bytes),
     }
+
+
+def _lines(entries: Sequence[Entry]) -> list[list[str]]:
+    """Return the labels of the configurations that a line joins, line by line."""
+    methods = dict.fromkeys(entry.method for entry in entries)
+    return [
+        [entry.label for entry in joined]
+        for method in methods
+        for joined in lines_of([e for e in entries if e.method == method]).values()
+    ]
 
 
 TEXT_CONTRAST = 5.5

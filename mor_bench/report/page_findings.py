@@ -6,8 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from mor_bench.analysis.selection_text import ERROR
 from mor_bench.report.number_format import number, whole
+from mor_bench.report.training_curves import still_falling
 
 Data = Mapping[str, Any]
 
@@ -108,8 +111,13 @@ def _learning(data: Data) -> str:
 
 
 def _losses(data: Data) -> str:
-    n = len(data["losses"])
-    return f"Loss of {n} {'training' if n == 1 else 'trainings'} from beginning to end"
+    methods = {row["label"]: row["method"] for row in data["rows"]}
+    return still_falling(
+        [
+            (methods[curves["label"]], np.array(curves.get("validation") or curves["loss"]))
+            for curves in data["losses"]
+        ]
+    )
 
 
 def _costs(data: Data) -> str:

@@ -173,16 +173,23 @@ def _still_falling(
     curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]],
 ) -> str:
     """Say whose held-out loss, or else training loss, falls most in the last part of training."""
-    falls: dict[str, float] = {}
+    shown = []
     for method, rows in trained.items():
         for row in rows:
             training, held_out = curves[row.label]
             curve = held_out if len(held_out) > 1 else training
-            if len(curve) > 1:
-                losses = curve[:, 1]
-                n = max(1, round(LAST * len(losses)))
-                before, after = np.median(losses[-2 * n : -n]), np.median(losses[-n:])
-                falls[method] = max(falls.get(method, -np.inf), 1 - float(after / before))
+            shown.append((method, curve[:, 1]))
+    return still_falling(shown)
+
+
+def still_falling(shown: Sequence[tuple[str, NDArray[np.float64]]]) -> str:
+    """Say which of some named loss curves falls most in the last part of the training."""
+    falls: dict[str, float] = {}
+    for method, losses in shown:
+        if len(losses) > 1:
+            n = max(1, round(LAST * len(losses)))
+            before, after = np.median(losses[-2 * n : -n]), np.median(losses[-n:])
+            falls[method] = max(falls.get(method, -np.inf), 1 - float(after / before))
     if not falls:
         return "Losses over the training"
     method = max(falls, key=lambda key: falls[key])

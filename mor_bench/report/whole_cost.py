@@ -87,9 +87,9 @@ class Costs:
 
     @property
     def most_queries(self) -> int:
-        """The end of the axis: a power of ten beyond most break-even points."""
+        """The end of the axis: a power of ten beyond the break-even points and the bars."""
         most = max((line.break_even or 1 for line in self.lines), default=1)
-        return int(10 ** min(ceil(log10(max(most, 1))) + 1, 9))
+        return int(10 ** min(ceil(log10(max(most, self.queries, 1))) + 1, 9))
 
     @property
     def queries(self) -> int:

@@ -5,7 +5,10 @@ Report.kinds.frontier = (figure, data) => {
   const plot = figure.querySelector(".plot");
   // Much smaller errors than needed are of no use, and would compress the scale.
   const needed = data.rows.filter((r) => !r.reference && r.error.median > 0).map((r) => r.error.median);
-  const FLOOR = Math.max(1e-4, Math.min(...needed, data.needs.error ?? Infinity) / 10);
+  let FLOOR = Math.max(1e-4, Math.min(...needed, data.needs.error ?? Infinity) / 10);
+  const near = data.rows.map((r) => r.error.median).filter((value) => value >= FLOOR / 3);
+  FLOOR = Math.min(FLOOR, ...near); // A value slightly below stands in its place.
+  const EDGE = FLOOR / 2; // Smaller errors stand here, apart from all others.
   const TOP = 200; // Larger errors are of no use; one outlier would stretch the axis.
   const redraw = () => show();
   const error = R.choice(figure, "error", [
@@ -18,7 +21,7 @@ Report.kinds.frontier = (figure, data) => {
 
   const x = (row) => (time.value === "work" ? row.work : row.latency[time.value]);
   const y = (row) => row.error[error.value];
-  const inside = (value) => Math.min(Math.max(value, FLOOR), TOP);
+  const inside = (value) => (value < FLOOR ? EDGE : Math.min(value, TOP));
   let hidden = new Set(); // methods that the legend hides
   let size = [500, 450]; // of the plot in pixels; after drawing, the real one
 
@@ -130,7 +133,10 @@ Report.kinds.frontier = (figure, data) => {
   const entryOf = (row) => R.plain(row.untested ? `${row.method} †` : row.method);
   const labelOf = (row) => row.name.split(" · ")[1] ?? row.name;
 
-  function trace(rows, group, named) {
+  const DASHES = ["solid", "dash", "dot", "dashdot"];
+
+  // One line of a method; the first of them stands for all in the legend.
+  function trace(rows, group, named, number) {
     const style = R.styleOf(data, rows[0]);
     const colour = R.colourOf(style);
     const medians = error.value === "median" && time.value === "median";
@@ -143,7 +149,7 @@ Report.kinds.frontier = (figure, data) => {
       textposition: "top right", textfont: { color: R.textColourOf(style), size: 12 },
       hovertext: rows.map(hoverOf), hoverinfo: "text",
       visible: hidden.has(entryOf(rows[0])) ? "legendonly" : true,
-      line: { color: colour, width: 1 },
+      line: { color: colour, width: 1, dash: DASHES[number % 4] }, showlegend: number === 0,
       marker: {
         color: colour, size: 10, line: { color: colour, width: 1.5 },
         symbol: rows.map((row) => style.symbol + open(row)),
@@ -216,7 +222,7 @@ Report.kinds.frontier = (figure, data) => {
       return [{
         x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: best.shift, ay: side * best.away,
         text: R.plain(text),
-        bgcolor: R.theme().paper, arrowhead: 2, arrowside: "start", startarrowhead: 0,
+        bgcolor: R.theme().paper, arrowhead: 2, standoff: 6,
         font: { size: 11, color: R.theme().ink }, arrowcolor: R.theme().quiet,
       }];
     });
@@ -262,7 +268,10 @@ Report.kinds.frontier = (figure, data) => {
     for (const group of data.groups) {
       const mine = rows.filter((row) => row.group === group);
       for (const method of new Set(mine.map((row) => row.method))) {
-        traces.push(trace(mine.filter((row) => row.method === method), group, named));
+        const lines = data.lines
+          .map((labels) => mine.filter((row) => row.method === method && labels.includes(row.label)))
+          .filter((members) => members.length);
+        traces.push(...lines.map((members, number) => trace(members, group, named, number)));
       }
     }
     traces.push(steps(rows));
@@ -272,7 +281,7 @@ Report.kinds.frontier = (figure, data) => {
       xaxis: time.value === "work" ? R.countAxis(title, range.x) : R.logAxis(title, { range: range.x }),
       yaxis: R.logAxis(`relative L2 error, ${error.selectedOptions[0].text} (%)`, { range: range.y }),
       shapes, annotations: [...annotations, ...counted, ...cuts(visible, range, taken, front)],
-      ...R.legend(traces.length + data.groups.length, R.isNarrow() ? 400 : 560),
+      ...R.legend(traces.filter((t) => t.showlegend !== false).length + data.groups.length, R.isNarrow() ? 400 : 560),
     });
     its.legend.groupclick = "toggleitem";
     const drawn = R.draw(plot, traces, its);
@@ -286,7 +295,8 @@ Report.kinds.frontier = (figure, data) => {
     if (following) return;
     following = true;
     plot.on("plotly_restyle", () => {
-      hidden = new Set(plot.data.filter((t) => t.visible === "legendonly").map((t) => t.name));
+      hidden = new Set(plot.data.filter((t) => t.visible === "legendonly" && t.showlegend !== false)
+        .map((t) => t.name));
       show();
     });
     plot.on("plotly_afterplot", fit);
