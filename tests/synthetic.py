@@ -160,9 +160,9 @@ def put_samples(
     forces[-1, 2] = 0.7
     wrong = min(errors.relative_l2.max(), 1.0) * generator.random()
     worst = {"reference": reference, "forces": forces, "prediction": reference * (1 + wrong)}
-    typical = {**worst, "prediction": reference * (1 + 0.3 * wrong)}
+    middle = {**worst, "prediction": reference * (1 + 0.3 * wrong)}
     named = {f"worst_{name}": array for name, array in worst.items()}
-    named |= {f"typical_{name}": array for name, array in typical.items()}
+    named |= {f"middle_{name}": array for name, array in middle.items()}
     comparison.put(row, {**timed, **vars(errors), **named})
     return row
 

@@ -227,7 +227,7 @@ def test_the_command_says_which_swept_value_it_took(cache: Path, tmp_path: Path)
     done = invoke(*options, "--seed=4")
     assert done.exit_code == 0, done.output
     assert " ".join(done.stdout.split()).startswith(
-        "iterations = 20, the first of 3 values in the method's file; "
+        "iterations = 20, the first of the 3 values of its sweep; "
         "choose another one with --set iterations=VALUE"
     )
     assert "20 iterations, " in done.stdout

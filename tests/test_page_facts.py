@@ -108,7 +108,7 @@ def test_strains_are_those_of_the_stored_displacements() -> None:
     mesh = box_mesh((2.0, 1.0, 1.0), (2, 1, 1))
     stretches = np.array([1.2, 0.9, 0.95])
     u = mesh.points * (stretches - 1)
-    item = Sampled(entry(0.001, 1.0), {"worst_reference": u, "typical_reference": 0 * u})
+    item = Sampled(entry(0.001, 1.0), {"worst_reference": u, "middle_reference": 0 * u})
     ((name, text),) = strain_facts([item], {"points": mesh.points, "cells": mesh.cells})
     assert name == "strains"
     assert text.startswith("stretches from 0.9 to 1.2, det F at least 1, at the")

@@ -26,7 +26,7 @@ FIGURE_NAMES = {
 ERROR = "relative L2 error"
 """The one name of this error in sentences, on the page and in pictures."""
 
-RUNNER_UP = "runner-up"
+RUNNER_UP = "best other method"
 """What the second is: the fastest, or by offline cost the cheapest, of those that qualify. A
 configuration of the winner's own method is none."""
 

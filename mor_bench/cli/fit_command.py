@@ -96,7 +96,7 @@ def fit(
     iterations = "" if fitted.iterations is None else f", {fitted.iterations:,} iterations"
     for name, values in fitted.first_of.items():
         print_wrapped(
-            f"{name} = {values[0]!r}, the first of {len(values)} values in the method's file; "
+            f"{name} = {values[0]!r}, the first of the {len(values)} values of its sweep; "
             f"choose another one with --set {name}=VALUE"
         )
     seconds = seconds_text(fitted.seconds)

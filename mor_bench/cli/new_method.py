@@ -44,7 +44,7 @@ def new_method(
     toml, source = write_method(name, folder)
     print(toml, source, sep="\n")
     tests = f"pytest -k {name}; " if source.parent != toml.parent else ""
-    print(f"Next: mor-bench check {toml}; {tests}mor-bench run beam-tiny -m {toml}")
+    print(f"Next: mor-bench check {toml}; {tests}mor-bench run beam-tiny -m fem -m {toml}")
 
 
 def write_method(name: str, folder: Path) -> tuple[Path, Path]:

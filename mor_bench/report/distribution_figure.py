@@ -25,7 +25,7 @@ from mor_bench.report.canvas import (
     shortened,
     uncut,
 )
-from mor_bench.report.entries import Analysis, best_per_method, entries_of
+from mor_bench.report.entries import SELECTED, Analysis, entries_of, selected_per_method
 from mor_bench.report.labels import Note, annotate
 from mor_bench.report.method_styles import readable, style_of
 from mor_bench.report.number_format import number
@@ -37,7 +37,7 @@ MOST_LINES = 14
 
 CAPTION = (
     "Height: the share of test loads (or of queries) with at most this error (or latency). Each "
-    "method has its most accurate configuration, by the error that the verdict uses. Full-order "
+    f"method has {SELECTED}. Full-order "
     "solves on the dataset's mesh are in the lower panel only, because their error is that of "
     "their tolerance. A line that ends below 100 % has loads without a prediction. An arrow "
     "leads to values beyond the axis. Dotted: the dataset's need."
@@ -73,7 +73,7 @@ def staircases(
     """Read the errors in % ("relative_l2") or the latencies in ms ("latency_ms") of all methods."""
     entries = entries_of(comparison, dataset, analysis)
     names, found = short_names(entry.row for entry in entries), []
-    for entry in best_per_method(entries):
+    for entry in selected_per_method(entries):
         if key == "relative_l2" and entry.row.reference:
             continue
         try:
@@ -102,7 +102,7 @@ def error_distribution(
     finding += f"{number(errors[0].p95)} %"
     if len(errors) > 1:
         finding += f", {shortened(errors[-1].name, 40)} by {number(errors[-1].p95)} %"
-    subject = f"{dataset}: distribution of errors and latencies, the best configuration per method"
+    subject = f"{dataset}: distribution of errors and latencies, a configuration per method"
     figure = new_figure(3.6 * (1 + bool(latencies)), finding, subject)
     panels = figure.subplots(1 + bool(latencies), 1, squeeze=False).ravel()
     dashes = dashes_of([stairs.method for stairs in (*errors, *latencies)])

@@ -232,6 +232,10 @@ def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
     ]
 
 
+SELECTED = "its fastest configuration that qualifies, or else its most accurate one"
+"""What `selected_per_method` returns of each method, in words."""
+
+
 def selected_per_method(entries: Sequence[Entry]) -> list[Entry]:
     """Return each method's fastest configuration that qualifies, or else its most accurate one."""
     fastest: dict[str, Entry] = {}

@@ -21,7 +21,7 @@ from mor_bench.report.canvas import (
     plain,
     shortened,
 )
-from mor_bench.report.entries import Analysis, Entry, best_per_method, entries_of
+from mor_bench.report.entries import SELECTED, Analysis, Entry, entries_of, selected_per_method
 from mor_bench.report.method_styles import style_of
 from mor_bench.report.number_format import number
 from mor_bench.report.published_figures import SCENES, scene_of
@@ -34,8 +34,7 @@ FAR = 2.0
 """Samples above this multiple of the 99th percentile lie beyond the axis."""
 
 CAPTION = (
-    "Each dot is a test sample. Each panel shows a method's most accurate "
-    "configuration, by the error that the verdict uses. "
+    f"Each dot is a test sample. Each panel shows a method, with {SELECTED}. "
     "Full-order solves on the dataset's mesh are left out. "
     "The line is the least-squares line through the origin. "
     "Its slope (mm of error per m of deformation) compares methods at a glance. "
@@ -71,7 +70,7 @@ def error_against_deformation(
     None if there are no raw samples with an error.
     """
     entries = entries_of(comparison, dataset, analysis)
-    best = [e for e in best_per_method(entries) if not e.row.reference]
+    best = [e for e in selected_per_method(entries) if not e.row.reference]
     found = [s for e in best if (s := _read(comparison, e)) is not None]
     panels = [samples for samples in found if samples.slope is not None]
     if not panels:

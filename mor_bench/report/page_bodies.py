@@ -16,8 +16,8 @@ from mor_bench.report.page_worst import LOAD_OF_KIND
 from mor_bench.report.projection import normals
 from mor_bench.scene.mesh import Mesh
 
-KINDS = ("worst", "typical")
-"""Samples that a run stores: the largest and the median error e."""
+KINDS = ("worst", "middle")
+"""Samples that a run stores: the largest error e, and the median deformation."""
 
 MOST_EDGES = 4000
 """Larger surfaces show only their sharp edges."""

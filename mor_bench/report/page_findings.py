@@ -137,8 +137,8 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         "Coloured: the prediction, by its error in mm. Blue lines: the full-order reference. "
         "Grey lines: the body at rest. The arrow shows place and direction of the force. "
         "Above each view: the largest error at a node and the relative L2 error of the drawn load. "
-        "Each method shows the test load with its own largest, or median, mean error e. Two "
-        "methods can thus show different loads, and the largest relative error may be at another. "
+        "The load with the largest mean error e is each method's own, and the largest relative "
+        "error may be at another load. That with the median deformation is the same for all. "
         "Drag to turn, scroll to zoom; both views turn together. By keyboard: Tab to a view, then "
         "arrow keys, + and −, or Home. Errors beyond half the body's size are cut.",
     ),

@@ -80,7 +80,7 @@ def _standing(entries: Sequence[Entry], view: View) -> Standing:
         return Standing("does not qualify", f"test error {percent(found.error)} % ({how})")
     best = min(qualified, key=lambda entry: entry.latency_ms)
     values = view.names[best.row.dataset][best.label].values
-    small = [f"at {percent(best.error)} %", values]
+    small = [f"at {percent(best.error)} %", values, "timing not stable" if best.unstable else ""]
     return Standing(
         f"{number(best.latency_ms)} ms", ", ".join(filter(None, small)), best.latency_ms
     )

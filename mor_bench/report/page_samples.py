@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.report.entries import Entry, best_per_method
+from mor_bench.report.entries import Entry, selected_per_method
 from mor_bench.report.error_over_position import AZIMUTH, ELEVATION, median_per_patch
 from mor_bench.report.projection import View, normals
 from mor_bench.report.singular_values import spectrum_of
@@ -53,12 +53,12 @@ def sampled(
 ) -> list[Sampled]:
     """Read the raw samples of one configuration per method.
 
-    These are the `preferred` ones first, then the best one of every other method.
+    These are the `preferred` ones first, then the selected one of every other method.
     """
     chosen: dict[str, Entry] = {}
     for entry in preferred:
         chosen.setdefault(entry.method, entry)
-    others = [entry for entry in best_per_method(entries) if entry.method not in chosen]
+    others = [entry for entry in selected_per_method(entries) if entry.method not in chosen]
     found = []
     for entry in [*chosen.values(), *others]:
         try:

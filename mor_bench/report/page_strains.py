@@ -31,6 +31,6 @@ def strain_facts(
     text = (
         f"stretches from {number(float(stretches.min()))} to {number(float(stretches.max()))}, "
         f"det F at least {number(least)}, at the quadrature points of the {len(fields)} stored "
-        "test loads (the worst and the typical one of each method shown)"
+        "test loads (the worst and the middle one of each method shown)"
     )
     return [("strains", text)]

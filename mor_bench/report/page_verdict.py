@@ -235,6 +235,10 @@ def _pays_off(known: FullOrder | None, first: Entry) -> str:
     return f"{text} ({whole(tuned)} with tuning)." if tuned is not None else f"{text}."
 
 
+ALIKE_S = 1.0
+"""Offline cost in core-seconds below which the order of fits is partly chance."""
+
+
 def _by_offline(
     qualified: Sequence[Entry], cheapest: str | None, names: Mapping[str, str]
 ) -> Ranking:
@@ -251,7 +255,12 @@ def _by_offline(
         "Offline cost: core-seconds of training data and fit. Repeated fits differ, so costs "
         "are compared with two digits; the order of fits of less than a second is partly chance."
     )
-    return Ranking("offline cost", f"Take {names[first.label]}", picks, sentence)
+    alike = [e for e in qualified if e.method == first.method and cost(e) < ALIKE_S]
+    title = f"Take {names[first.label]}"
+    if len(alike) > 1:
+        title = f"Take {first.method}, any of {len(alike)}"
+        sentence += f" So {listed([names[e.label] for e in alike])} cannot be told apart."
+    return Ranking("offline cost", title, picks, sentence)
 
 
 def _pick(part: str, entry: Entry, names: Mapping[str, str]) -> Pick:

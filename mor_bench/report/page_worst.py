@@ -21,7 +21,7 @@ NEEDED = {"relative_l2", "max_nodal_m", "amplitude_m"}
 
 LOAD_OF_KIND = {
     "worst": "the test load with its largest mean error e",
-    "typical": "the test load with its median mean error e",
+    "middle": "the test load with the median deformation",
 }
 """What the stored samples are, by their kind."""
 

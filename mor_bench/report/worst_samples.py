@@ -31,7 +31,7 @@ from mor_bench.report.canvas import (
     shortened,
     uncut,
 )
-from mor_bench.report.entries import Analysis, Entry, best_per_method, entries_of
+from mor_bench.report.entries import SELECTED, Analysis, Entry, entries_of, selected_per_method
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.projection import View, normals
 from mor_bench.report.rendering import WIRE, Look, Shot, show_shots
@@ -51,8 +51,7 @@ VIEW = View(azimuth=-68.0, elevation=20.0)
 """x points right, z points up; the faces y-min and z-max are visible."""
 
 CAPTION = (
-    "Each panel shows a method's most accurate configuration, by the error "
-    "that the verdict uses, on its test sample "
+    f"Each panel shows a method, with {SELECTED}, on its test sample "
     "with the largest e. A mean hides such samples. Full-order solves on the dataset's mesh are "
     "left out. Samples without a prediction cannot "
     "be drawn; the title gives their number. Colours: distance of each node of the prediction "
@@ -106,7 +105,7 @@ def worst_samples(
     except (OSError, KeyError):
         return None
     entries = entries_of(comparison, dataset, analysis)
-    best = [e for e in best_per_method(entries) if not e.row.reference]
+    best = [e for e in selected_per_method(entries) if not e.row.reference]
     found = [s for e in best if (s := _read(comparison, e)) is not None]
     samples = [s for s in found if s.largest_m > 0 or not np.isfinite(s.error_m)]
     samples = sorted(samples, key=lambda s: s.largest_m)[:MOST_PANELS]

@@ -127,7 +127,8 @@ class Comparison:
         `seeds_relative_l2`, `seeds_validation_relative_l2` (n_seeds - 1, n): of other seeds.
         `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3): the sample with the
         largest finite error.
-        `typical_prediction`, `typical_reference`, `typical_forces`: the one with the median error.
+        `middle_prediction`, `middle_reference`, `middle_forces`: the one with the median
+        deformation, the same for all methods.
         `loss_curve`, `validation_curve` (n_intervals,): losses, evenly spread over the training.
 
         Raises
@@ -137,7 +138,7 @@ class Comparison:
         """
         path = self.samples_path(row)
         arrays, lengths = read_hdf5(path), {"test": row.n_test, "validation": row.n_validation}
-        if any(name in arrays for name in ("worst_reference", "typical_reference")):
+        if any(name in arrays for name in ("worst_reference", "middle_reference")):
             with suppress(OSError, KeyError):
                 lengths["nodes"] = len(self.dataset_arrays(row.dataset)["points"])
         check_arrays(path, arrays, OF_ROWS, lengths)

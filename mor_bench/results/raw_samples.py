@@ -60,10 +60,10 @@ OF_ROWS = {
     "seeds_mean_dof_m": Allowed("real", ("seeds", "test"), 0.0),
     "seeds_relative_l2": Allowed("real", ("seeds", "test"), 0.0),
     "seeds_validation_relative_l2": Allowed("real", ("seeds", "validation"), 0.0),
-    **{f"{sample}_prediction": _PREDICTION for sample in ("worst", "typical")},
+    **{f"{sample}_prediction": _PREDICTION for sample in ("worst", "middle")},
     **{
         f"{sample}_{part}": _NODES
-        for sample in ("worst", "typical")
+        for sample in ("worst", "middle")
         for part in ("reference", "forces")
     },
     "loss_curve": _CURVE,

@@ -34,7 +34,7 @@ SCORE_CHUNK = 256
 """Number of samples in one request for predictions."""
 
 Score = dict[str, NDArray[Any]]
-"""Per-sample errors on a test set, range flags if any, and the worst and the typical sample."""
+"""Per-sample errors on a test set, range flags if any, and the worst and the middle sample."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class _Scorer:
                 name: np.concatenate([getattr(part, name) for part in errors]) for name in ERRORS
             }
             score |= {name: np.concatenate([part[name] for part in derived]) for name in derived[0]}
-            typical = _typical(score["mean_dof_m"])
+            middle = _middle(score["amplitude_m"])
             left_s = max(1.0, until - monotonic())
-            one = np.array([typical])
+            one = np.array([middle])
             again = self._predictions(test, one, left_s, Path(folder) / "answers.npy")[0]
         if flags is not None:
             score["flagged"] = np.asarray(flags, dtype=bool)
@@ -117,9 +117,9 @@ class _Scorer:
             "worst_prediction": worst.prediction,
             "worst_reference": test.references[worst.number],
             "worst_forces": test.forces[worst.number] * has_forces,  # nothing to draw otherwise
-            "typical_prediction": again,
-            "typical_reference": test.references[typical],
-            "typical_forces": test.forces[typical] * has_forces,
+            "middle_prediction": again,
+            "middle_reference": test.references[middle],
+            "middle_forces": test.forces[middle] * has_forces,
         }
 
     def _predictions(
@@ -162,9 +162,9 @@ _COST: TypeAdapter[dict[str, float] | None] = TypeAdapter(dict[str, float] | Non
 """The content of cost-SET.json."""
 
 
-def _typical(errors: NDArray[np.float64]) -> int:
-    """Return the number of the sample with the median error; infinite errors count as largest."""
-    return int(np.argsort(np.nan_to_num(errors, nan=np.inf), kind="stable")[(len(errors) - 1) // 2])
+def _middle(amplitudes: NDArray[np.float64]) -> int:
+    """Return the number of the sample with the median deformation, the same for all methods."""
+    return int(np.argsort(amplitudes, kind="stable")[(len(amplitudes) - 1) // 2])
 
 
 class _Worst:

@@ -58,6 +58,9 @@ class Snapshots:
     free_displacements: NDArray[np.float64]
     min_det_f: NDArray[np.float64]
 
+    def __repr__(self) -> str:
+        return f"<Snapshots of {self.scene.name}: {len(self)} samples>"
+
     @classmethod
     def empty(cls, scene: Scene) -> Snapshots:
         """Return an empty set of samples for a scene."""
@@ -159,6 +162,10 @@ class Dataset:
     n_refused: int
     n_unused: int = 0
     tests: dict[str, Snapshots] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        parts = f"{len(self.train)} train, {len(self.validation)} validation, {len(self.test)} test"
+        return f"<Dataset {self.scene.name}: {parts} samples>"
 
     def _repr_html_(self) -> str:
         """Show the parts of the dataset in a notebook."""

@@ -44,9 +44,9 @@ LEFT_OUT = (
     "worst_prediction",
     "worst_reference",
     "worst_forces",
-    "typical_prediction",
-    "typical_reference",
-    "typical_forces",
+    "middle_prediction",
+    "middle_reference",
+    "middle_forces",
 )
 """Arrays of a configuration that the compact form does not keep."""
 

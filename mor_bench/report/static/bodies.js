@@ -19,7 +19,7 @@ Report.kinds.bodies = (figure, data) => {
   const methods = R.options(data, kinds.includes("worst")
     ? found.samples.filter((s) => s.kind === "worst") : found.samples);
   const redraw = () => show();
-  const ranks = { worst: "with the largest mean error e", typical: "with the median mean error e" };
+  const ranks = { worst: "with the largest mean error e", middle: "with the median deformation, the same for all" };
   const kind = R.choice(figure, "test load", kinds.map((k) => [k, ranks[k]]), redraw);
   const chosen = [
     R.choice(figure, "left", methods, redraw), R.choice(figure, "right", methods, redraw),

@@ -281,7 +281,7 @@ Report.kinds.frontier = (figure, data) => {
       xaxis: time.value === "work" ? R.countAxis(title, range.x) : R.logAxis(title, { range: range.x }),
       yaxis: R.logAxis(`relative L2 error, ${error.selectedOptions[0].text} (%)`, { range: range.y }),
       shapes, annotations: [...annotations, ...counted, ...cuts(visible, range, taken, front)],
-      ...R.legend(traces.filter((t) => t.showlegend !== false).length + data.groups.length, R.isNarrow() ? 400 : 560),
+      ...R.legend(traces.filter((t) => t.showlegend !== false).length + data.groups.length, R.isNarrow() ? 400 : Math.min(560, Math.max(400, window.innerHeight - 280))),
     });
     its.legend.groupclick = "toggleitem";
     const drawn = R.draw(plot, traces, its);

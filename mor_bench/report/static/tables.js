@@ -59,15 +59,16 @@ Report.table = (grid, data) => {
   const rows = data.order.map((label) => R.rowOf(data, label)).map((row, id) => ({
     ...row, id, error_value: row.error.median, latency_value: row.latency.median,
   }));
+  const narrow = R.isNarrow(); // Name, error and latency fit a phone.
   const table = new Tabulator(grid, {
     data: rows,
     layout: "fitColumns",
     columnHeaderSortMulti: false,
     columns: [
-      { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: 150, widthGrow: 2 },
-      { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: 126, ...numbers },
+      { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: narrow ? 112 : 150, widthGrow: 2 },
+      { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: narrow ? 106 : 126, ...numbers },
       { title: "latency (ms)", field: "latency_value", formatter: figureCell("latency"), minWidth: 112, ...numbers },
-      { title: "offline (core-s)", field: "offline", formatter: figureCell("offline"), minWidth: 84, ...numbers },
+      { title: "offline (core\u2011s)", field: "offline", formatter: figureCell("offline"), minWidth: 96, ...numbers },
       { title: "told", field: "group", formatter: textCell, minWidth: 150, widthGrow: 2 },
       { title: "qualifies", field: "answer", formatter: textCell, sorter: natural, minWidth: 96, widthGrow: 2 },
     ],
