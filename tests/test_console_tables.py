@@ -187,7 +187,7 @@ def test_the_runner_up_and_loads_beyond_the_training_are_named(
     made: Comparison, shown: Any, tmp_path: Path
 ) -> None:
     text = " ".join(shown(80).split())
-    assert "- Runner-up: fem · tol 0.1, " in text
+    assert "- Best other method: fem · tol 0.1, " in text
     said = (
         r"Beyond the training loads, the median relative L2 error of \S+ · k\d+ is [\d.]+ % on 2x"
     )

@@ -333,5 +333,5 @@ def test_the_runner_up_is_one_of_another_method_with_the_same_words(tmp_path: Pa
     # on the card, and in words
     assert alone.count("No other method that was tried qualifies.") >= 2
     assert both.count("best other method hpod") == 2  # by latency, by offline cost
-    assert "Runner-up: hpod, 2 ms at 0.2 %." in both
+    assert "Best other method: hpod, 2 ms at 0.2 %." in both
     assert "No other method that was tried qualifies." not in both

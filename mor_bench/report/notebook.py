@@ -82,11 +82,12 @@ class Comparison(results.Comparison):
     def plot_error_distribution(
         self, ax: Axes | None = None, *, dataset: str | None = None
     ) -> Axes:
-        """Draw the share of test loads with at most an error, for the best of each method."""
+        """Draw the share of test loads with at most an error, for one of each method."""
         from mor_bench.report.distribution_figure import draw_distribution, staircases
 
         name = self._dataset(dataset)
-        found = _known(name, staircases(self, name, "relative_l2"))
+        self.analysis = self.analysis or analyse(self)
+        found = _known(name, staircases(self, name, "relative_l2", self.analysis))
         draw_distribution(ax := _axes(ax), found, needs_of(self, name))
         return ax
 

@@ -233,7 +233,7 @@ METHODS: dict[str, tuple[dict[str, Any], float]] = {
     "pca-regression-linear": ({}, 1e-7),
     "pca-regression": ({}, 1e-7),
     "pgd-weak-form": ({"n_terms": 20}, 5e-2),
-    "pgd-snapshots": ({}, 1e-2),
+    "pgd-snapshots": ({"n_terms": 10}, 1e-8),  # later terms fit round-off of the samples
     "hybrid": ({"start": "linear-fem", "start_parameters": {}, "tolerance": 1e-12}, 1e-10),
 }
 
