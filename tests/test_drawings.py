@@ -13,7 +13,7 @@ from matplotlib.lines import AxLine
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from mor_bench.report.canvas import Picture
+from mor_bench.report.canvas import Picture, wrapped
 from mor_bench.report.entries import entries_of
 from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time
@@ -184,3 +184,8 @@ def test_inverting_a_pair_inverts_its_factor_and_its_interval(
     both = [{**record, "a": "a", "b": "b"}, {**record, "a": "b", "b": "a"}]
     pairs = pairs_at(made, "beam-tiny", 0.01, {"pairwise": both})
     assert (pairs.cells[0][1], pairs.intervals[0][1]) == (cell, interval)
+
+
+def test_no_line_of_a_title_ends_within_a_name_or_before_a_unit() -> None:
+    lines = wrapped("The error of pca-regression-linear · k10 is 5 %", 30, len)
+    assert lines == ["The error of", "pca-regression-linear · k10 is", "5 %"]

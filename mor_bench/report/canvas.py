@@ -162,10 +162,10 @@ def balanced(text: str, room: float, width: Callable[[str], float]) -> list[str]
 def wrapped(text: str, room: float, width: Callable[[str], float]) -> list[str]:
     """Break a text into lines of at most a width; a longer word stands alone.
 
-    No line breaks between a number and its unit.
+    No line breaks between a number and its unit, nor within a name such as ``hpod · r5``.
     """
-    lines = [""]
-    for word in re.split("[ \n]+", joined_units(text).strip()):
+    lines, text = [""], joined_units(text).replace(" · ", f"{KEPT}·{KEPT}")
+    for word in re.split("[ \n]+", text.strip()):
         longer = f"{lines[-1]} {word}".strip()
         if lines[-1] and width(longer) > room:
             lines.append(word)
