@@ -300,7 +300,6 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
         "Named test sets",
         "Fresh test set",
         "Worst test loads of each method",
-        "Test loads that are hard for most methods",
         "Time at error: median latency at a median relative L2 error",
         "Error at time: median relative L2 error within a median latency",
         "Whole cost",

@@ -65,7 +65,7 @@ Report.table = (grid, data) => {
     layout: "fitColumns",
     columnHeaderSortMulti: false,
     columns: [
-      { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: narrow ? 112 : 150, widthGrow: 2 },
+      { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: narrow ? 136 : 150, widthGrow: 2 },
       { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: narrow ? 106 : 126, ...numbers },
       { title: "latency (ms)", field: "latency_value", formatter: figureCell("latency"), minWidth: 112, ...numbers },
       { title: "offline (core\u2011s)", field: "offline", formatter: figureCell("offline"), minWidth: 96, ...numbers },
