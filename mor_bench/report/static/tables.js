@@ -69,8 +69,8 @@ Report.table = (grid, data) => {
       { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: narrow ? 106 : 126, ...numbers },
       { title: "latency (ms)", field: "latency_value", formatter: figureCell("latency"), minWidth: 112, ...numbers },
       { title: "offline (core\u2011s)", field: "offline", formatter: figureCell("offline"), minWidth: 96, ...numbers },
-      { title: "told", field: "group", formatter: textCell, minWidth: 150, widthGrow: 2 },
-      { title: "qualifies", field: "answer", formatter: textCell, sorter: natural, minWidth: 96, widthGrow: 2 },
+      { title: "told", field: "group", formatter: textCell, minWidth: narrow ? 200 : 150, widthGrow: 2 },
+      { title: "qualifies", field: "answer", formatter: textCell, sorter: natural, minWidth: narrow ? 240 : 96, widthGrow: 2 },
     ],
     rowFormatter: (row) => {
       const { qualified, failed, status, front } = row.getData();
