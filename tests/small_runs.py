@@ -68,7 +68,7 @@ def keep_fit_record(
         parameters=parameters,
         warnings=[],
     )
-    folder = cache / "fits" / f"{method}-0123456789"
+    folder = cache / "fits" / f"{method}-{size[0]}-{size[1]}"
     folder.mkdir(parents=True)
     (folder / "fit.json").write_text(record.model_dump_json())
 

@@ -73,6 +73,9 @@ def test_only_earlier_fits_of_the_same_method_predict_its_time(tmp_path: Path) -
     stated = fit_seconds(*arguments)
     keep_fit_record(tmp_path, "pod-tensor", configuration.parameters, size, 1e6)
     assert fit_seconds(*arguments) == stated != 1e6
+    for small in ((size[0] // 8, size[1]), (size[0], size[1] // 8)):
+        keep_fit_record(tmp_path, "pod", configuration.parameters, small, 1e6)
+        assert fit_seconds(*arguments) == stated  # a small fit mostly takes a fixed time
     keep_fit_record(tmp_path, "pod", configuration.parameters, size, 1e6)
     assert fit_seconds(*arguments) == 1e6
 

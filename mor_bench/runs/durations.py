@@ -118,10 +118,17 @@ def compile_seconds(
     return pace.interpreter * (KERNELS_S + first + side_by_side)
 
 
+ALIKE = 2.0
+"""Largest ratio of unknowns, or of samples, to an earlier fit whose time can be scaled.
+
+A small fit mostly takes a fixed time, which does not grow.
+"""
+
+
 def fit_seconds(
     configuration: Configuration, context: RunContext, size: tuple[int, int], pace: Pace
 ) -> float | None:
-    """Scale the time of a fit from earlier fits here, or from the method's file.
+    """Scale the time of a fit from earlier fits of about its size, or from the method's file.
 
     The time of an iteration is assumed not to depend on the number of training samples.
     """
@@ -130,17 +137,19 @@ def fit_seconds(
     training = configuration.training
     if iterates and training and training.fit_seconds:
         return training.fit_seconds
-    times: list[float] = []
+    near: list[float] = []
+    far: list[float] = []
     for record in _earlier_fits(context.cache, configuration):
         with suppress(ZeroDivisionError):
             grows = record.needs_snapshots and not iterates
-            samples = n_train / record.n_train if grows else 1.0
-            times.append(record.fit_s * n_dofs / record.n_dofs * samples)
-    if times:
-        return median(times)
+            factors = n_dofs / record.n_dofs, n_train / record.n_train if grows else 1.0
+            alike = all(1 / ALIKE <= factor <= ALIKE for factor in factors)
+            (near if alike else far).append(record.fit_s * factors[0] * factors[1])
+    if near:
+        return median(near)
     stated = configuration.method.fit_seconds(context.options.profile)
     if stated is None:
-        return None
+        return median(far) if far else None
     samples = 1.0 if iterates else n_train / REFERENCE_TRAINING
     return stated * pace.of(configuration) * n_dofs / REFERENCE_DOFS * samples
 
