@@ -76,7 +76,8 @@ RACES = [(name, race) for name, spec in SPECS.items() for race in spec.battery.r
 """Every method of the suite against its baselines, from the method files.
 
 The ratio of a network to a full-order model depends on the machine: Transolver was 55 times as fast
-as `fem-jacobi-pcg` on one and 19 times on another. A bound leaves room for that.
+as `fem-jacobi-pcg` on one and 19 times on another. A bound leaves room for that. A second race
+against another network, which depends less on the machine, notices when such a method slows down.
 """
 
 N_SAMPLES = 120

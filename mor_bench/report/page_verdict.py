@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
-from mor_bench.analysis.selection_text import NO_RUNNER_UP, RUNNER_UP
+from mor_bench.analysis.selection_text import CHANCE_S, NO_RUNNER_UP, RUNNER_UP
 from mor_bench.report.entries import Entry, most_accurate
 from mor_bench.report.number_format import DASH, number, percent, span, whole
 from mor_bench.report.short_names import renamed
@@ -235,10 +235,6 @@ def _pays_off(known: FullOrder | None, first: Entry) -> str:
     return f"{text} ({whole(tuned)} with tuning)." if tuned is not None else f"{text}."
 
 
-ALIKE_S = 1.0
-"""Offline cost in core-seconds below which the order of fits is partly chance."""
-
-
 def _by_offline(
     qualified: Sequence[Entry], cheapest: str | None, names: Mapping[str, str]
 ) -> Ranking:
@@ -255,7 +251,7 @@ def _by_offline(
         "Offline cost: core-seconds of training data and fit. Repeated fits differ, so costs "
         "are compared with two digits; the order of fits of less than a second is partly chance."
     )
-    alike = [e for e in qualified if e.method == first.method and cost(e) < ALIKE_S]
+    alike = [e for e in qualified if e.method == first.method and cost(e) < CHANCE_S]
     title = f"Take {names[first.label]}"
     if len(alike) > 1:
         title = f"Take {first.method}, any of {len(alike)}"

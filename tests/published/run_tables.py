@@ -219,27 +219,6 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     return markdown([*headings, "smallest median %; its max %"], body)
 
 
-def named_sets(source: str, dataset: str = "", methods: str = "") -> str:
-    """Show errors on the named test sets: of each method the configuration for the least error."""
-    run = run_of(source)
-    name = dataset or next(iter(run.datasets))
-    bounds = error_bounds(run, name)
-    rows = [chosen(mine, bounds) for mine in _by_method(_rows(run, dataset, methods)).values()]
-    names = list(dict.fromkeys(each for row in rows for each in row.sets))
-    body = []
-    for row in rows:
-        cells = [f"`{row.method}`", class_text(row, given_by(run, name)), _configuration(row)]
-        for each in names:
-            found = row.sets.get(each)
-            cells.append(
-                DASH
-                if found is None
-                else f"{_percent(found.rel_l2_median)}; {_percent(found.rel_l2_p95)}"
-            )
-        body.append(cells)
-    return markdown(["method", "is given", "configuration", *(f"`{n}`" for n in names)], body)
-
-
 def verdict(source: str, dataset: str = "") -> str:
     """State the verdict on a dataset in the words of the report."""
     run = run_of(source)
@@ -339,7 +318,6 @@ RUN_TABLES: dict[str, Callable[..., str]] = {
     "selected": selected,
     "best-of-class": best_of_class,
     "fastest": fastest,
-    "named-sets": named_sets,
     "verdict": verdict,
     "headline": headline,
     "indicated": indicated,
