@@ -15,7 +15,7 @@ mor_bench.options.InvalidOptionError: unknown option `sed`; did you mean 'seeds'
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
@@ -228,6 +228,17 @@ class FitOptions(TrainOptions):
     ] = None
 
 
+DEFAULT_SEEDS: dict[str, int] = {"quick": 1, "full": 3}
+"""Number of trainings of a configuration that has a seed, by profile."""
+
+DEFAULT_TIME_LIMIT_S: dict[str, float] = {"quick": 1200.0, "full": 1800.0}
+"""Limit of the fitting time per method and dataset in seconds, by profile."""
+
+
+def _by_profile(defaults: Mapping[str, float]) -> str:
+    return f"{defaults['quick']:g}; full: {defaults['full']:g}"
+
+
 class RunOptions(TrainOptions):
     """Options of `mor_bench.run`."""
 
@@ -273,14 +284,14 @@ class RunOptions(TrainOptions):
                 "Number of trainings, each with its own seed, for configurations that have a seed."
             ),
         ),
-        CommandLine(metavar="N", default="1; full: 3"),
+        CommandLine(metavar="N", default=_by_profile(DEFAULT_SEEDS)),
     ] = None
     time_limit_s: Annotated[
         float | None,
         Field(
             gt=0, description="Limit of the total fitting time per method and dataset, in seconds."
         ),
-        CommandLine("--time-limit", metavar="SECONDS", default="1200; full: 1800"),
+        CommandLine("--time-limit", metavar="SECONDS", default=_by_profile(DEFAULT_TIME_LIMIT_S)),
     ] = None
     memory_limit_bytes: Annotated[
         float | None,

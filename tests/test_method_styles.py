@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mor_bench.report.method_styles import (
     DARK,
+    LINES,
     OTHER,
     WHITE,
     MethodStyle,
@@ -25,7 +26,7 @@ METHODS = list_suite("methods")
 
 FOREIGN = ("my-method", "a", "b", "Ω", "pod2")
 
-PINNED = ("#C17829", "#D2822D", "octagon", "8", OTHER)
+PINNED = ("#C17829", "#D2822D", "octagon", "8", "dot", ":", OTHER)
 """The style of `my-method`: published pictures keep it."""
 
 LEAST_LIGHT, LEAST_DARK = 8.0, 13.5
@@ -73,6 +74,8 @@ def test_no_two_methods_look_the_same() -> None:
     for look in ("colour", "dark_colour"):
         for mark in ("marker", "symbol"):
             assert len({(getattr(s, look), getattr(s, mark)) for s in styles}) == len(styles)
+    assert len({(s.family, s.colour, s.dash) for s in styles}) == len(styles)
+    assert len({(s.dash, s.line) for s in styles}) == len({s.dash for s in styles}) == len(LINES)
     pairs = {(s.marker, s.symbol) for s in styles}
     assert len(pairs) == len({s.marker for s in styles}) == len({s.symbol for s in styles})
 

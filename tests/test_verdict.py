@@ -161,14 +161,14 @@ def test_close_latencies_are_listed_as_undecided() -> None:
 
 
 def test_the_command_that_times_again_repeats_what_was_recorded() -> None:
-    settings = {"profile": "full", "train": True, "seeds": 3, "limit": None, "device": "cpu"}
-    settings |= {"budget": {"configurations": 16, "seconds": 1800.0}, "version": "0"}
+    settings = {"profile": "full", "train": True, "seeds": 2, "limit": None, "device": "cpu"}
+    settings |= {"budget": {"configurations": 16, "seconds": 900.0}, "version": "0"}
     made = Comparison(Path("a run"), {}, [a_row(dataset="e")], settings=settings)
     made.datasets |= {"d": {}, "e": {}}
     made.methods["pod"] = {}
     draws = draws_of(made, "e", 20, np.random.default_rng(0))
     command = retime_command(decide(made, "e", Requirements(), draws))
-    options = "--profile full --train --seeds 3 --time-limit 1800"
+    options = "--profile full --train --seeds 2 --time-limit 900"
     assert sorted(command.split()) == sorted(
         f"mor-bench run d e -m pod {options} --out 'a run' --retime".split()
     )

@@ -11,7 +11,12 @@ from typing import Any
 from mor_bench.analysis.frontier import median_error, median_latency_ms
 from mor_bench.analysis.told import class_text, told_text
 from mor_bench.analysis.verdict import RULE, Requirements, Verdict
-from mor_bench.options import RunOptions, command_line
+from mor_bench.options import (
+    DEFAULT_SEEDS,
+    DEFAULT_TIME_LIMIT_S,
+    RunOptions,
+    command_line,
+)
 from mor_bench.results.parts import ErrorSummary
 from mor_bench.results.row import Row, SetErrors
 
@@ -110,12 +115,13 @@ def headline(verdict: Verdict) -> str:
         if verdict.nearest is None:
             return found
         return f"{found} The nearest is {_short(verdict.nearest)}, with {_misses(verdict)}."
+    doubt = " (timing not stable)" if row.latency_ms and row.latency_ms.stable is False else ""
     rank = "the only one that qualifies"
     if len(verdict.qualified) > 1:
         rank = f"the fastest of {len(verdict.qualified)} that qualify"
     return (
         f"{_named(row)} wins: {rank} among {tried}, with a latency of "
-        f"{median_latency_ms(row):.3g} ms. {_confirmation(verdict, row)}"
+        f"{median_latency_ms(row):.3g} ms{doubt}. {_confirmation(verdict, row)}"
     )
 
 
@@ -234,12 +240,14 @@ def run_command(asked: Mapping[str, Any]) -> str:
     """Return the command of a run with these settings, datasets and methods."""
     settings = dict(asked)
     budget = settings.pop("budget", None) or {}
+    profile = settings.get("profile") or RunOptions().profile
     given = {**settings, "time_limit_s": budget.get("seconds")}
+    usual = {"seeds": DEFAULT_SEEDS[profile], "time_limit_s": DEFAULT_TIME_LIMIT_S[profile]}
     words = ["mor-bench", "run", *settings["datasets"]]
     words += [word for name in settings.get("methods", ()) for word in ("-m", name)]
     for name, field, line in command_line(RunOptions):
         value = given.get(name)
-        if value is not None and value != field.default:
+        if value is not None and value != usual.get(name, field.default):
             shown = f"{value:.15g}" if isinstance(value, float) else str(value)
             words += [line.flag] if value is True else [line.flag, shown]
     return shlex.join(words)

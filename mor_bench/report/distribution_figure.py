@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,8 +25,7 @@ from mor_bench.report.canvas import (
     uncut,
 )
 from mor_bench.report.entries import SELECTED, Analysis, entries_of, selected_per_method
-from mor_bench.report.labels import Note, annotate
-from mor_bench.report.method_styles import readable, style_of
+from mor_bench.report.method_styles import style_of
 from mor_bench.report.number_format import number
 from mor_bench.report.short_names import short_names
 from mor_bench.results.comparison import Comparison
@@ -42,12 +40,6 @@ CAPTION = (
     "their tolerance. A line that ends below 100 % has loads without a prediction. An arrow "
     "leads to values beyond the axis. Dotted: the dataset's need."
 )
-
-
-Dash = Literal["-", "--", ":", "-."]
-
-_DASHES: tuple[Dash, ...] = ("-", "--", ":", "-.")
-"""Line styles of the members of a family, as on the page."""
 
 
 @dataclass(frozen=True)
@@ -105,10 +97,9 @@ def error_distribution(
     subject = f"{dataset}: distribution of errors and latencies, a configuration per method"
     figure = new_figure(3.6 * (1 + bool(latencies)), finding, subject)
     panels = figure.subplots(1 + bool(latencies), 1, squeeze=False).ravel()
-    dashes = dashes_of([stairs.method for stairs in (*errors, *latencies)])
-    draw_distribution(panels[0], errors, needs, dashes)
+    draw_distribution(panels[0], errors, needs)
     for axes in panels[1:]:
-        _draw(axes, latencies, needs.latency_ms, "ms", dashes)
+        _draw(axes, latencies, needs.latency_ms, "ms")
         axes.set_xlabel("latency of a query, at most (ms)", fontsize=LABEL)
         axes.set_ylabel("queries (%)", fontsize=LABEL)
     return Picture(
@@ -116,29 +107,14 @@ def error_distribution(
     )
 
 
-def draw_distribution(
-    axes: Axes,
-    errors: Sequence[Staircase],
-    needs: Requirements,
-    dashes: Mapping[str, Dash] | None = None,
-) -> None:
-    """Draw the share of test loads with at most an error, a staircase per method.
-
-    `dashes` are the line styles if other panels show the methods, too.
-    """
-    dashes = dashes or dashes_of([stairs.method for stairs in errors])
-    _draw(axes, errors, None if needs.error is None else 100 * needs.error, "%", dashes)
+def draw_distribution(axes: Axes, errors: Sequence[Staircase], needs: Requirements) -> None:
+    """Draw the share of test loads with at most an error, a staircase per method."""
+    _draw(axes, errors, None if needs.error is None else 100 * needs.error, "%")
     axes.set_xlabel("relative L2 error of a test load, at most (%)", fontsize=LABEL)
     axes.set_ylabel("test loads (%)", fontsize=LABEL)
 
 
-def _draw(
-    axes: Axes,
-    found: Sequence[Staircase],
-    need: float | None,
-    unit: str,
-    dashes: Mapping[str, Dash],
-) -> None:
+def _draw(axes: Axes, found: Sequence[Staircase], need: float | None, unit: str) -> None:
     """Draw the staircases, with their names beside them."""
     dress(axes)
     axes.set_xscale("log")
@@ -149,45 +125,29 @@ def _draw(
     if need is not None:
         axes.axvline(need, color=GREY, linestyle=":", linewidth=1.2, zorder=1)
     log_ticks(axes.xaxis, axes.get_xlim())
-    (start, end), notes, lines = axes.get_xlim(), [], []
     for stairs in found:
         style, x = style_of(stairs.method), stairs.finite
         y = 100 * (np.searchsorted(stairs.values, x, side="right") / len(stairs.values))
-        axes.step(
-            x,
-            y,
-            where="post",
-            color=style.colour,
-            linewidth=1.6,
-            label=stairs.method,
-            linestyle=dashes[stairs.method],
-        )
-        lines.append(np.column_stack([x, y]))
-        if start <= x[-1] <= end:
-            continue
-        text = f"{shortened(stairs.name, 30)}: up to {number(float(x[-1]))} {unit}"
-        text = f"{text} →" if x[-1] > end else f"← {text}"
-        place = (end, float(np.interp(end, x, y))) if x[-1] > end else (start, 50.0)
-        colour = readable(style.colour)
-        notes.append(Note(text, [place], colour, "bold", _ABOVE_ONE_ANOTHER, must=True))
-    annotate(axes, notes, [], lines)
-    _legend(axes, found, dashes)
+        axes.step(x, y, where="post", color=style.colour, linewidth=1.6, linestyle=style.line)
+    _legend(axes, found, unit)
 
 
-def _legend(axes: Axes, found: Sequence[Staircase], dashes: Mapping[str, Dash]) -> None:
-    """Name the lines beside the axes, in the order in which they reach half of the height."""
-    ordered = sorted(found, key=lambda stairs: float(np.median(stairs.values)))
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=style_of(stairs.method).colour,
-            linestyle=dashes[stairs.method],
-            linewidth=1.8,
-            label=plain(shortened(stairs.name, 30)),
-        )
-        for stairs in ordered
-    ]
+def _legend(axes: Axes, found: Sequence[Staircase], unit: str) -> None:
+    """Name the lines beside the axes, in the order in which they reach half of the height.
+
+    A line that ends beyond the axes is named with its end.
+    """
+    handles = []
+    for stairs in sorted(found, key=lambda stairs: float(np.median(stairs.values))):
+        style, last = style_of(stairs.method), float(stairs.finite[-1])
+        name, (start, end) = shortened(stairs.name, 30), axes.get_xlim()
+        if last > end:
+            name += f"\nup to {number(last)} {unit} →"
+        elif last < start:
+            name += f"\n← up to {number(last)} {unit}"
+        line = Line2D([], [], color=style.colour, linestyle=style.line, linewidth=1.8)
+        line.set_label(plain(name))
+        handles.append(line)
     axes.legend(
         handles=handles,
         title="from left to right",
@@ -197,17 +157,3 @@ def _legend(axes: Axes, found: Sequence[Staircase], dashes: Mapping[str, Dash]) 
         fontsize=NOTE,
         frameon=False,
     )
-
-
-def dashes_of(methods: Sequence[str]) -> dict[str, Dash]:
-    """Return a line style per method, so that lines of one family, with similar hues, differ."""
-    seen: dict[str, int] = {}
-    found: dict[str, Dash] = {}
-    for method in sorted(dict.fromkeys(methods)):
-        family = style_of(method).family
-        found[method] = _DASHES[seen.get(family, 0) % len(_DASHES)]
-        seen[family] = seen.get(family, 0) + 1
-    return found
-
-
-_ABOVE_ONE_ANOTHER = ((-6, -8), (-6, -21), (-6, -34), (-6, -47), (-6, -60))

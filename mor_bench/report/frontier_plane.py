@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from mor_bench.analysis.verdict import Requirements
 from mor_bench.report.canvas import shortened, uncut
 from mor_bench.report.entries import Entry
+from mor_bench.report.method_styles import LINES, Line
 from mor_bench.report.short_names import value_text, varied_keys
 
 WORST_PERCENT = 150.0
@@ -21,17 +21,17 @@ WORST_PERCENT = 150.0
 BELOW_NEEDS = 0.01
 """Errors below this part of the needed error lie beyond the axis."""
 
-LINES = ("-", (0, (5, 1.5)), (0, (1.5, 1.5)), (0, (5, 1.5, 1.5, 1.5)))
-"""Lines of a method whose second swept parameter varies, too: one per value."""
-
 
 @dataclass(frozen=True)
 class Series:
-    """Configurations of a method that differ in their first swept parameter, joined by a line."""
+    """Configurations of a method that differ in their first swept parameter, joined by a line.
+
+    If a second swept parameter varies, too, each of its values has a line of its own dash.
+    """
 
     name: str
     members: Sequence[Entry]
-    line: Any
+    line: Line
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def series_of(shown: Sequence[Entry]) -> list[Series]:
     for method in dict.fromkeys(e.method for e in shown):
         groups = lines_of([e for e in shown if e.method == method])
         found += [
-            Series(shortened(f"{method}, {text}" if text else method, 44), members, LINES[i % 4])
+            Series(shortened(f"{method}, {text}" if text else method, 44), members, LINES[i % 4][0])
             for i, (text, members) in enumerate(groups.items())
         ]
     return found

@@ -1,8 +1,9 @@
-"""Colour and marker of each method, the same in every picture and on every page.
+"""Colour, marker and dash of each method, the same in every picture and on every page.
 
-A family has a hue; its members differ by shade and marker. The hues follow Okabe and Ito's palette
-for colour-blind readers, darkened where a line on white would be too faint. The order of a family's
-members is permanent: append new methods at its end, so that published styles stay as they are.
+A family has a hue; its members differ by shade, marker and dash. The hues follow Okabe and Ito's
+palette for colour-blind readers, darkened where a line on white would be too faint. The order of a
+family's members is permanent: append new methods at its end, so that published styles stay as they
+are.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import colorsys
 import hashlib
 from dataclasses import dataclass
+from typing import Literal
 
 OTHER = "other"
 """Family of the methods that are not part of the suite."""
@@ -30,6 +32,10 @@ class MethodStyle:
         Name of the marker in plotly.
     marker : str
         The same marker in matplotlib.
+    dash : str
+        Name of the line's dash in plotly.
+    line : str
+        The same dash in matplotlib.
     family : str
         Family that gives the hue, such as ``projection``.
     """
@@ -38,8 +44,21 @@ class MethodStyle:
     dark_colour: str
     symbol: str
     marker: str
+    dash: str
+    line: Line
     family: str
 
+
+Line = Literal["-", "--", ":", "-."]
+"""Dash of a line in matplotlib."""
+
+LINES: tuple[tuple[Line, str], ...] = (
+    ("-", "solid"),
+    ("--", "dash"),
+    (":", "dot"),
+    ("-.", "dashdot"),
+)
+"""Dashes of lines in matplotlib and plotly, in the order in which they are given."""
 
 _Shades = tuple[tuple[str, str], ...]
 """Colours for light and dark backgrounds; the first is the family's own."""
@@ -188,21 +207,22 @@ def _other_style(method: str) -> MethodStyle:
     digest = hashlib.sha256(method.encode()).digest()
     hue = int.from_bytes(digest[:2], "big") / 65536
     marker, symbol = _OTHER_MARKERS[digest[2] % len(_OTHER_MARKERS)]
+    line, dash = LINES[digest[3] % len(LINES)]
     red, green, blue = colorsys.hls_to_rgb(hue, 0.5, 0.65)
     colour = _hex(red, green, blue)
-    return MethodStyle(
-        readable(colour, WHITE, 3.5), readable(colour, DARK, 5.0), symbol, marker, OTHER
-    )
+    light, dark = readable(colour, WHITE, 3.5), readable(colour, DARK, 5.0)
+    return MethodStyle(light, dark, symbol, marker, dash, line, OTHER)
 
 
 def _suite() -> dict[str, MethodStyle]:
-    """Give every member of a family a shade, and a marker that differs within the family."""
+    """Give every member of a family a shade, a dash, and a marker that differs in the family."""
     styles = {}
     for first, (family, (shades, members)) in enumerate(_FAMILIES.items()):
         for i, method in enumerate(members):
             marker, symbol = _MARKERS[(first + i) % len(_MARKERS)]
+            line, dash = LINES[i % len(LINES)]
             colour, dark = shades[_OTHER_SHADE.get(method, i) % len(shades)]
-            styles[method] = MethodStyle(colour, dark, symbol, marker, family)
+            styles[method] = MethodStyle(colour, dark, symbol, marker, dash, line, family)
     return styles
 
 

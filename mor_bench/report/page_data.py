@@ -12,7 +12,7 @@ import numpy as np
 from mor_bench.analysis.verdict import Requirements, needs_of
 from mor_bench.report.entries import Analysis, Entry, by_group
 from mor_bench.report.frontier_plane import lines_of
-from mor_bench.report.method_styles import DARK, readable, style_of
+from mor_bench.report.method_styles import DARK, LINES, readable, style_of
 from mor_bench.report.number_format import number, percent, span
 from mor_bench.report.page_bodies import bodies
 from mor_bench.report.page_facts import answer_of, method_facts, reason_of
@@ -69,6 +69,7 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
         "mesh_at_least": any(entry.row.discretisation_at_least for entry in entries),
         "winner": shown.card.rankings[0].picks[0].entry.label if shown.card.rankings else None,
         "styles": {entry.method: _style(entry.method) for entry in entries},
+        "dashes": [dash for _, dash in LINES],
         "groups": list(by_group(entries)),
         "rows": [_row(shown, entry, needs) for entry in entries],
         "lines": _lines(entries),

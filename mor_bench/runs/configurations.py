@@ -68,7 +68,8 @@ class Budget:
     seconds: float
 
 
-BUDGETS = {"quick": Budget(12, 1200.0), "full": Budget(16, 1800.0)}
+MOST_CONFIGURATIONS = {"quick": 12, "full": 16}
+"""Number of configurations per method and dataset, by profile."""
 
 
 @dataclass(frozen=True)

@@ -7,17 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError
-from mor_bench.options import Device, RunOptions, TrainOptions
-from mor_bench.runs.configurations import BUDGETS, Budget
+from mor_bench.options import DEFAULT_SEEDS, DEFAULT_TIME_LIMIT_S, Device, RunOptions, TrainOptions
+from mor_bench.runs.configurations import MOST_CONFIGURATIONS, Budget
 from mor_bench.runs.listener import Listener
 from mor_bench.sandbox.process import default_memory_limit_bytes
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import default_cache
 from mor_bench.training_options import TrainingOptions
 from mor_bench.version import __version__
-
-DEFAULT_SEEDS = {"quick": 1, "full": 3}
-"""Default number of trainings of each configuration."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +46,10 @@ class RunContext:
             If options exclude each other, or there is no such device.
         """
         check_pool(options.workers, options.cluster)
-        budget = BUDGETS[options.profile]
-        budget = replace(budget, seconds=options.time_limit_s or budget.seconds)
+        budget = Budget(
+            MOST_CONFIGURATIONS[options.profile],
+            options.time_limit_s or DEFAULT_TIME_LIMIT_S[options.profile],
+        )
         return cls(options, budget, training_options(options, budget.seconds), listener)
 
     @property

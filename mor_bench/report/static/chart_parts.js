@@ -121,6 +121,10 @@ Object.assign(Report, (() => {
     const row = rowOf(data, label);
     return row ? styleOf(data, row).symbol : "circle";
   };
+  const dash = (data, label) => {
+    const row = rowOf(data, label);
+    return row ? styleOf(data, row).dash : "solid";
+  };
   const nameOf = (data, label) => rowOf(data, label)?.name ?? label;
   const hover = (lines) => lines.map(Report.plain).join("<br>");
   // The line of the winner's method, or the first one.
@@ -142,7 +146,7 @@ Object.assign(Report, (() => {
   }
 
   return {
-    axis, logAxis, countAxis, widthOf, layout, legend, draw, choice, slider, tick, rowOf, styleOf, colour, textColour, symbol,
+    axis, logAxis, countAxis, widthOf, layout, legend, draw, choice, slider, tick, rowOf, styleOf, colour, textColour, symbol, dash,
     nameOf, hover, options, short, isNarrow, say, winnerOf,
   };
 })());

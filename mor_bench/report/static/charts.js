@@ -17,7 +17,7 @@ Report.kinds.distributions = (figure, data) => {
       type: "scatter", mode: "lines", name: R.plain(R.nameOf(data, line.label)),
       x: line[kind.value].x, y: line[kind.value].share.map((s) => 100 * s),
       line: { color: R.colour(data, line.label), shape: "hv", width: 2,
-        dash: R.dashOf(data, line.label) },
+        dash: R.dash(data, line.label) },
       hovertemplate: `%{y:.3~g} % of ${kind.value === "error" ? "the loads" : "the queries"}: ` +
         `at most %{x:.3~g} ${kind.value === "error" ? "%" : "ms"}`,
     }));
@@ -45,15 +45,6 @@ Report.kinds.distributions = (figure, data) => {
     }));
   }
   return show;
-};
-
-// Members of one method family have similar hues; dashes tell their lines apart.
-Report.dashOf = (data, label) => {
-  const row = Report.rowOf(data, label);
-  const family = Report.styleOf(data, row).family;
-  const methods = [...new Set(data.rows.map((r) => r.method))];
-  const mine = methods.filter((m) => data.styles[m].family === family);
-  return ["solid", "dash", "dot", "dashdot"][mine.indexOf(row.method) % 4];
 };
 
 Report.kinds.deformations = (figure, data) => {
@@ -229,7 +220,7 @@ Report.kinds.costs = (figure, data) => {
       type: "scatter", mode: "lines", name: R.plain(R.nameOf(data, line.label)), x: counts,
       y: counts.map((n) => total(line, n)), legendgroup: R.plain(line.label),
       line: { color: R.colour(data, line.label), width: line.label === fullOrder ? 3 : 1.8,
-        dash: R.dashOf(data, line.label) },
+        dash: R.dash(data, line.label) },
       hovertemplate: "%{y:.3~g} core-s for %{x:.2~g} queries",
     }));
     for (const line of lines.filter((l) => l.break_even > 0)) {

@@ -133,8 +133,6 @@ Report.kinds.frontier = (figure, data) => {
   const entryOf = (row) => R.plain(row.untested ? `${row.method} †` : row.method);
   const labelOf = (row) => row.name.split(" · ")[1] ?? row.name;
 
-  const DASHES = ["solid", "dash", "dot", "dashdot"];
-
   // One line of a method; the first of them stands for all in the legend.
   function trace(rows, group, named, number) {
     const style = R.styleOf(data, rows[0]);
@@ -149,7 +147,7 @@ Report.kinds.frontier = (figure, data) => {
       textposition: "top right", textfont: { color: R.textColourOf(style), size: 12 },
       hovertext: rows.map(hoverOf), hoverinfo: "text",
       visible: hidden.has(entryOf(rows[0])) ? "legendonly" : true,
-      line: { color: colour, width: 1, dash: DASHES[number % 4] }, showlegend: number === 0,
+      line: { color: colour, width: 1, dash: data.dashes[number % data.dashes.length] }, showlegend: number === 0,
       marker: {
         color: colour, size: 10, line: { color: colour, width: 1.5 },
         symbol: rows.map((row) => style.symbol + open(row)),
