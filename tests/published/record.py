@@ -94,8 +94,8 @@ def record(name: str, allow_changes: bool = False) -> None:
         "commit": commit,
         "date": f"{date:%Y-%m-%d %H:%M} UTC",
         "seconds": round(seconds, 1),
-        "machine": f"{machine['processor']}, {machine['cores']} cores, "
-        f"{machine['memory_bytes'] / 2**30:.0f} GiB",
+        "machine": f"{machine['processor']} ({machine['processor_model']}), "
+        f"{machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB",
         "load_before": machine["load"][0],
         "python": machine["python"],
     }
