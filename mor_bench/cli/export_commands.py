@@ -32,6 +32,7 @@ WRITING = "Writing the files."
 app = typer.Typer(rich_markup_mode=None)
 export = typer.Typer(
     help="Write samples and results for other programs.",
+    epilog="mor-bench export COMMAND --help shows the options, examples and exit codes of one.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )

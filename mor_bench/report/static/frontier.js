@@ -237,7 +237,7 @@ Report.kinds.frontier = (figure, data) => {
   function finding(rows) {
     if (error.selectedIndex === 0 && time.selectedIndex === 0 && rows.length === all.length) return verdict;
     const [needed, named] = [data.needs.error, error.selectedOptions[0].text];
-    const able = rows.filter((row) => !needed || y(row) <= needed);
+    const able = rows.filter((row) => !row.failed && (!needed || y(row) <= needed));
     const within = needed ? ` with an error (${named}) of at most ${R.short(needed)} %` : "";
     if (!able.length) return `No configuration shown has an error (${named}) of at most ${R.short(needed)} %`;
     const best = able.reduce((a, b) => (x(b) < x(a) ? b : a));
