@@ -228,6 +228,9 @@ class FitOptions(TrainOptions):
     ] = None
 
 
+FOLDERS = "folders"
+"""Entry of a run's settings for the folders that its command named; a resumed run may change it."""
+
 DEFAULT_SEEDS: dict[str, int] = {"quick": 1, "full": 3}
 """Number of trainings of a configuration that has a seed, by profile."""
 

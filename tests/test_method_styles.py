@@ -26,7 +26,7 @@ METHODS = list_suite("methods")
 
 FOREIGN = ("my-method", "a", "b", "Ω", "pod2")
 
-PINNED = ("#C17829", "#D2822D", "octagon", "8", "dot", ":", OTHER)
+PINNED = MethodStyle("#C17829", "#D2822D", "octagon", "8", "dot", ":", OTHER)
 """The style of `my-method`: published pictures keep it."""
 
 LEAST_LIGHT, LEAST_DARK = 8.0, 13.5
@@ -102,6 +102,13 @@ def test_families_differ_for_colour_blind_readers(blindness: str) -> None:
         assert distance > 14, (a.family, b.family)
 
 
+@pytest.mark.parametrize("look", ["colour", "dark_colour"])
+def test_no_shade_of_a_family_looks_like_one_of_another(look: str) -> None:
+    shades = {(f, getattr(style_of(m), look)) for f, members in families().items() for m in members}
+    for (family, a), (other, b) in combinations(shades, 2):
+        assert family == other or np.linalg.norm(seen(a, "none") - seen(b, "none")) > 10, (a, b)
+
+
 @pytest.mark.parametrize("family", families())
 def test_shades_of_a_family_differ_on_both_backgrounds(family: str) -> None:
     styles = [style_of(method) for method in families()[family]]
@@ -116,7 +123,7 @@ def test_shades_of_a_family_differ_on_both_backgrounds(family: str) -> None:
 
 
 def test_the_style_of_a_foreign_method_is_stable_and_its_own() -> None:
-    assert style_of("my-method") == MethodStyle(*PINNED)
+    assert style_of("my-method") == PINNED
     assert len({style_of(method) for method in FOREIGN}) == len(FOREIGN)
     suite = {style_of(method).marker for method in METHODS}
     for method in FOREIGN:

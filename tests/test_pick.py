@@ -34,6 +34,7 @@ def test_the_command_that_times_again_has_the_options_of_the_run(small_run: Comp
     assert words[:3] == ["mor-bench", "run", "beam-tiny"]
     assert words[-3:] == ["--out", str(small_run.out), "--retime"]
     assert words[words.index("--limit") + 1] == str(LIMIT)
+    assert words[words.index("--cache") + 1] == small_run.settings["folders"]["cache"]
     assert "--time-limit" not in words
     assert "--seeds" not in words
     known = words[1 : words.index("-m")] + words[words.index("--limit") :]

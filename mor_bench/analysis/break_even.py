@@ -22,8 +22,8 @@ def break_even(
 
     The count is the offline cost (data and fit) beyond the preparation of the full-order model,
     divided by what a query saves, both in core-seconds. A query uses its latency times its threads.
-    The count compares two configurations: the selected one, and the fastest full-order one that is
-    at least as accurate by the errors that select.
+    The count compares two configurations that meet the same error by the errors that select: the
+    fastest of the method and the fastest full-order one. So all methods compare with the same one.
 
     Parameters
     ----------
@@ -63,10 +63,10 @@ def _break_even(rows: Sequence[Row], record: Record, bounds: Mapping[str, float]
         for other in ran
         if other.method == FULL_ORDER
         and other.latency_ms
-        and bounds[other.label] <= bounds[row.label]
+        and bounds[other.label] <= record["target_rel_l2_median"]
     ]
     if not full_order:
-        reason = f"no configuration of {FULL_ORDER} is as accurate"
+        reason = f"no configuration of {FULL_ORDER} is that accurate"
         return {**out, "verdict": "unknown", "reason": reason}
     fastest = min(full_order, key=median_latency_ms)
     full_order_ms = median_latency_ms(fastest)

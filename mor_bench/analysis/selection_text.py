@@ -14,6 +14,7 @@ from mor_bench.analysis.verdict import RULE, Requirements, Verdict
 from mor_bench.options import (
     DEFAULT_SEEDS,
     DEFAULT_TIME_LIMIT_S,
+    FOLDERS,
     RunOptions,
     command_line,
 )
@@ -239,9 +240,9 @@ def retime_command(verdict: Verdict) -> str:
 def run_command(asked: Mapping[str, Any]) -> str:
     """Return the command of a run with these settings, datasets and methods."""
     settings = dict(asked)
-    budget = settings.pop("budget", None) or {}
+    budget, folders = settings.pop("budget", None) or {}, settings.pop(FOLDERS, None) or {}
     profile = settings.get("profile") or RunOptions().profile
-    given = {**settings, "time_limit_s": budget.get("seconds")}
+    given = {**settings, **folders, "time_limit_s": budget.get("seconds")}
     usual = {"seeds": DEFAULT_SEEDS[profile], "time_limit_s": DEFAULT_TIME_LIMIT_S[profile]}
     words = ["mor-bench", "run", *settings["datasets"]]
     words += [word for name in settings.get("methods", ()) for word in ("-m", name)]

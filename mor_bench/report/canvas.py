@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,9 @@ WIDTH_IN = 7.05
 
 TITLE, LABEL, TICK, NOTE = 13.0, 11.0, 10.0, 9.5
 """Sizes of fonts in typographic points; the smallest is legible at a third of the pixels."""
+
+LONGEST_NAME = 60
+"""Most characters of a configuration's name; those of the suite have up to 49."""
 
 INK, GREY, LIGHT = "#222222", "#6e6e6e", "#d9d9d9"
 
@@ -260,6 +264,13 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def shortened(text: str, length: int) -> str:
-    """Cut a text to a number of characters, with an ellipsis if some are lost."""
-    return text if len(text) <= length else text[: length - 1] + "…"
+def shortened(name: str) -> str:
+    """Cut a name that is longer than any of the suite, with an ellipsis."""
+    return name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "…"
+
+
+def folded(name: str, width: int) -> str:
+    """Break the name of a configuration into lines, between its values where possible."""
+    kept = re.sub(r"(?<=[\w.]) (?=[\w.])", KEPT, shortened(name))
+    lines = textwrap.wrap(kept, width, break_on_hyphens=False)
+    return "\n".join(lines).replace(KEPT, " ")

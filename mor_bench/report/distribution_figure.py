@@ -18,6 +18,7 @@ from mor_bench.report.canvas import (
     NOTE,
     Picture,
     dress,
+    folded,
     log_ticks,
     new_figure,
     plain,
@@ -90,10 +91,10 @@ def error_distribution(
         return None
     latencies = staircases(comparison, dataset, "latency_ms", analysis)
     needs = needs_of(comparison, dataset)
-    finding = f"95 % of the loads: {shortened(errors[0].name, 40)} errs by at most "
+    finding = f"95 % of the loads: {shortened(errors[0].name)} errs by at most "
     finding += f"{number(errors[0].p95)} %"
     if len(errors) > 1:
-        finding += f", {shortened(errors[-1].name, 40)} by {number(errors[-1].p95)} %"
+        finding += f", {shortened(errors[-1].name)} by {number(errors[-1].p95)} %"
     subject = f"{dataset}: distribution of errors and latencies, a configuration per method"
     figure = new_figure(3.6 * (1 + bool(latencies)), finding, subject)
     panels = figure.subplots(1 + bool(latencies), 1, squeeze=False).ravel()
@@ -140,7 +141,7 @@ def _legend(axes: Axes, found: Sequence[Staircase], unit: str) -> None:
     handles = []
     for stairs in sorted(found, key=lambda stairs: float(np.median(stairs.values))):
         style, last = style_of(stairs.method), float(stairs.finite[-1])
-        name, (start, end) = shortened(stairs.name, 30), axes.get_xlim()
+        name, (start, end) = folded(stairs.name, 30), axes.get_xlim()
         if last > end:
             name += f"\nup to {number(last)} {unit} →"
         elif last < start:

@@ -16,6 +16,7 @@ from mor_bench.report.canvas import (
     NOTE,
     Picture,
     dress,
+    folded,
     length_unit,
     new_figure,
     plain,
@@ -127,10 +128,10 @@ def _finding(panels: list[Samples]) -> str:
     """Name the methods with the smallest and the largest slope."""
     slopes = {s.entry.method: 1e3 * s.slope for s in panels if s.slope is not None}
     least, most = min(slopes, key=lambda m: slopes[m]), max(slopes, key=lambda m: slopes[m])
-    text = f"Per metre of deformation, {shortened(least, 30)} errs by {number(slopes[least])} mm"
+    text = f"Per metre of deformation, {shortened(least)} errs by {number(slopes[least])} mm"
     if least == most:
         return text
-    return f"{text}, {shortened(most, 30)} by {number(slopes[most])} mm"
+    return f"{text}, {shortened(most)} by {number(slopes[most])} mm"
 
 
 def _panel(
@@ -165,7 +166,7 @@ def _panel(
         remarks.append(f"↑ {int(beyond.sum())} up to {number(per_m * float(e.max()))} {unit}")
         height = np.full(int(beyond.sum()), 1.08 * per_m * top)
         axes.plot(x[beyond], height, "^", color=style_of(samples.entry.method).colour, ms=6)
-    title = plain("\n".join([shortened(str(name), 27), *remarks]))
+    title = plain("\n".join([folded(str(name), 27), *remarks]))
     axes.set_title(title, fontsize=NOTE, loc="left", color=INK)
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_locator(MaxNLocator(4))

@@ -82,16 +82,16 @@ def fastest(shown: Sequence[Entry], needs: Requirements, verdict: Mapping[str, A
         able = [e for e in shown if e.error <= (needs.error or inf)]
         choice = min(able or shown, key=lambda e: e.latency_ms)
         limit = limit if able else ""
-    text = f"{shortened(choice.method, 40)} is fastest" + (f" below {limit}" if limit else "")
+    text = f"{shortened(choice.method)} is fastest" + (f" below {limit}" if limit else "")
     text += f": {number(choice.latency_ms)} ms"
     other = by_label.get(str(verdict.get("runner_up")))
     if other is None or other.latency_ms < 1.05 * choice.latency_ms:
         return text
     if other.label in verdict.get("undecided", ()):
-        return f"{text}, not surely faster than {shortened(other.method, 40)}"
+        return f"{text}, not surely faster than {shortened(other.method)}"
     times = f"{other.latency_ms / choice.latency_ms:.2g}"
     name = str(short_names(e.row for e in shown)[other.label])
-    return f"{text}, {times} times as fast as {shortened(name, 40)}"
+    return f"{text}, {times} times as fast as {shortened(name)}"
 
 
 def draw_frontier(axes: Axes, entries: Sequence[Entry], needs: Requirements) -> None:
@@ -216,7 +216,7 @@ def _cut_notes(shown: Sequence[Entry], names: Mapping[str, ShortName], plane: Pl
             value = f"{percent(entry.error)} %" if direction[1] else ""
             time = f"{number(entry.latency_ms)} ms" if direction[0] else ""
             name, colour = str(names[entry.label]), readable(style_of(entry.method).colour)
-            text = f"{shortened(name, 34)}: {', '.join(filter(None, (value, time)))}"
+            text = f"{shortened(name)}: {', '.join(filter(None, (value, time)))}"
             must = len(notes) < MUST_BE_LABELLED
             notes.append(Note(text, [plane.place(entry)], colour, must=must))
     return notes
@@ -239,7 +239,7 @@ def _notes(
         text = names[entry.label].values.split(", ")[0]
         if text and not plane.direction(entry):
             colour = readable(style_of(entry.method).colour)
-            notes.append(Note(shortened(text, 24), [plane.place(entry)], colour))
+            notes.append(Note(shortened(text), [plane.place(entry)], colour))
     return notes
 
 

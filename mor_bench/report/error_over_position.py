@@ -22,6 +22,7 @@ from mor_bench.report.canvas import (
     TICK,
     WIDTH_IN,
     Picture,
+    folded,
     log_ticks,
     new_figure,
     plain,
@@ -149,13 +150,11 @@ def _finding(maps: list[PatchErrors]) -> str:
     most = max(spread, key=lambda method: spread[method])
     least = min(spread, key=lambda method: spread[method])
     if spread[most] < 1.05 * spread[least]:
-        return (
-            f"The error of {shortened(most, 40)} varies {spread[most]:.2g}-fold with the position"
-        )
+        return f"The error of {shortened(most)} varies {spread[most]:.2g}-fold with the position"
     least = min(spread, key=lambda method: spread[method])
     return (
-        f"The position of the load changes the error of {shortened(most, 30)} "
-        f"{spread[most]:.2g}-fold, of {shortened(least, 30)} {spread[least]:.2g}-fold"
+        f"The position of the load changes the error of {shortened(most)} "
+        f"{spread[most]:.2g}-fold, of {shortened(least)} {spread[least]:.2g}-fold"
     )
 
 
@@ -234,5 +233,5 @@ def _draw_patches(
         zorder=6,
     )
     axes.plot(*screen[known & ~shown].T, "x", color=INK, ms=size, zorder=6)
-    title = plain(f"{shortened(found.name, 30)}\ntold: {found.told}")
+    title = plain(f"{folded(found.name, 30)}\ntold: {found.told}")
     axes.set_title(title, fontsize=NOTE, loc="left", color=INK)

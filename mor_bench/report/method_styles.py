@@ -1,9 +1,9 @@
 """Colour, marker and dash of each method, the same in every picture and on every page.
 
 A family has a hue; its members differ by shade, marker and dash. The hues follow Okabe and Ito's
-palette for colour-blind readers, darkened where a line on white would be too faint. The order of a
-family's members is permanent: append new methods at its end, so that published styles stay as they
-are.
+palette for colour-blind readers, with a violet, darkened where a line on white would be too faint.
+The order of a family's members is permanent: append new methods at its end, so that published
+styles stay as they are.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
         ),
     ),
     "neural operators and graphs": (
-        (("#2A93CC", "#7CC4EE"), ("#1B6A96", "#CBE9FA"), ("#3C8FB8", "#3D88B4")),
+        (("#6C45C9", "#AE97F2"), ("#432295", "#DDD4FB"), ("#8E6FDB", "#8F70E8")),
         ("deeponet", "fno", "mesh-graph-net", "pod-deeponet", "graph-u-net", "transolver"),
     ),
 }

@@ -34,8 +34,15 @@ MEANINGS = {
     "n_input_modes": "number of input modes",
     "n_output_modes": "number of output modes",
     "cubature_tolerance": "accepted error of the cubature",
+    "n_latent": "number of latent coordinates",
+    "n_force_modes": "number of modes of the internal force",
+    "n_clusters": "number of clusters of snapshots",
+    "n_terms": "number of separated terms",
+    "max_terms": "largest number of terms",
+    "position_degree": "polynomial degree in the position of the load",
+    "static_correction": "linear answer to what the modes leave of the load",
 }
-"""Meanings of some parameters with short names."""
+"""Meanings of the suite's swept parameters with short names."""
 
 BEFORE_UNIT = re.compile(
     r"(?<=\d) (?=(?:%|[nµm]?s|min|h|[kmµ]?m[²³]?|[kM]?N|[kMG]?B|[kMG]?Pa"

@@ -30,8 +30,8 @@ def performance_profile(analysis: Analysis) -> Picture | None:
     n = len(found["problems"])
     first = {method: factors.count(1.0) for method, factors in solving.items()}
     quick, able = max(first, key=lambda m: first[m]), max(solving, key=lambda m: len(solving[m]))
-    finding = f"{shortened(quick, 40)} is fastest on {first[quick]} of {n} problems"
-    also = "it also" if able == quick else shortened(able, 40)
+    finding = f"{shortened(quick)} is fastest on {first[quick]} of {n} problems"
+    also = "it also" if able == quick else shortened(able)
     finding += f"; {also} solves the most, {len(solving[able])}"
     subject = f"Performance profile over {found['n_datasets']} datasets, a staircase per method"
     figure = new_figure(4.4, finding, subject)
@@ -56,10 +56,10 @@ def _draw(axes: Axes, solving: dict[str, list[float]], n: int) -> None:
         beyond = [factor for factor in factors if factor > end]
         colour = readable(style.colour)
         if beyond:
-            text = f"{shortened(method, 30)}: {number(max(beyond))}× →"
+            text = f"{shortened(method)}: {number(max(beyond))}× →"
             notes.append(Note(text, [(end, float(y[-1 - len(beyond)]))], colour, "bold", must=True))
         places = list(zip(x[::-1].tolist(), y[::-1].tolist(), strict=True))
-        notes += [] if beyond else [Note(shortened(method, 40), places, colour, "bold", must=True)]
+        notes += [] if beyond else [Note(shortened(method), places, colour, "bold", must=True)]
         marks += places[1:-1]
         lines.append(np.column_stack([np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]]))
     axes.set_xscale("log")

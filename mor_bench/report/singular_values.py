@@ -203,7 +203,7 @@ def _method_names(used: dict[str, list[int]], bottom: float) -> list[Note]:
     for place, (method, ranks) in enumerate(used.items()):
         places = [(float(rank), bottom) for rank in ranks[::-1]]
         low = STEP_PT * (place + 0.95) - 5.5
-        colour, name = readable(style_of(method).colour), shortened(method, 30)
+        colour, name = readable(style_of(method).colour), shortened(method)
         beside = ((9.0, low), (-9.0, low))
         notes.append(Note(name, places, colour, "bold", beside, leader=False))
     return notes

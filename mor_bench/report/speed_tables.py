@@ -207,7 +207,7 @@ def break_even_table(
         "Break-even, queries: core-seconds of data and fit beyond those of the full-order model, "
         "divided by those that a query saves. "
         "With tuning: all fits of the method count, failed ones too. "
-        "The saving is against the fastest full-order configuration that is at least as accurate "
+        "The saving is against the fastest full-order configuration that meets the same error "
         "by the same rule. "
         "Never: the full-order model is as fast."
     )

@@ -69,7 +69,7 @@ def draw_learning(axes: Axes, lines: Lines, names: dict[str, ShortName]) -> None
         line.set(linestyle="-", linewidth=1.4, markeredgecolor="white")
         name, colour = _name(names, label), readable(style.colour)
         places = [(float(x), float(y)) for x, y in shown[::-1]]
-        notes.append(Note(shortened(name, 40), places, colour, "bold", must=True))
+        notes.append(Note(shortened(name), places, colour, "bold", must=True))
         marks += places
         for (x, y), (_, cut) in zip(points, shown, strict=True):
             if y != cut:
@@ -111,7 +111,7 @@ def _most_gained(lines: Lines, names: dict[str, ShortName]) -> str:
     if after >= before:
         return f"No method gains from more samples, up to {many:,.0f}"
     return (
-        f"{shortened(_name(names, label), 50)} gains most from samples: {number(before)} % with "
+        f"{shortened(_name(names, label))} gains most from samples: {number(before)} % with "
         f"{few:,.0f}, {number(after)} % with {many:,.0f}"
     )
 
@@ -195,9 +195,7 @@ def still_falling(shown: Sequence[tuple[str, NDArray[np.float64]]]) -> str:
     method = max(falls, key=lambda key: falls[key])
     if falls[method] < 0.05:
         return "No loss falls by more than 5 % at the end: the trainings have levelled off"
-    return (
-        f"The loss of {shortened(method, 40)} still falls by {100 * falls[method]:.0f} % at the end"
-    )
+    return f"The loss of {shortened(method)} still falls by {100 * falls[method]:.0f} % at the end"
 
 
 def _loss_panel(
@@ -217,7 +215,7 @@ def _loss_panel(
             drawn.set_marker("o" if len(curve) == 1 else "")
         if len(training) and names[row.label].values:
             end = (float(training[-1, 0]), float(training[-1, 1]))
-            text = shortened(names[row.label].values, 24)
+            text = shortened(names[row.label].values)
             notes.append(Note(text, [end], readable(colour), offsets=((-7, 9), (-7, -9), (-7, 20))))
         if len(held_out) and i == 0:
             end = (float(held_out[-1, 0]), float(held_out[-1, 1]))
@@ -228,6 +226,6 @@ def _loss_panel(
     axes.set_ylabel("loss", fontsize=LABEL)
     iterations = {row.training.iterations for row in rows if row.training}
     count = next(iter(iterations)) if len(iterations) == 1 else None
-    title = shortened(rows[0].method, 30) + (f", {count:,} iterations" if count else "")
+    title = shortened(rows[0].method) + (f", {count:,} iterations" if count else "")
     axes.set_title(plain(title), loc="left", fontsize=NOTE + 1, color=INK)
     return notes

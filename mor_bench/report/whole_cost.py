@@ -16,10 +16,10 @@ from mor_bench.report.canvas import (
     NOTE,
     Picture,
     dress,
+    folded,
     log_ticks,
     new_figure,
     plain,
-    shortened,
 )
 from mor_bench.report.entries import Analysis, Entry, entries_of
 from mor_bench.report.labels import Note, annotate
@@ -172,7 +172,7 @@ def draw_totals(axes: Axes, costs: Costs) -> None:
             mark.set_markeredgecolor(INK)
         places = [(float(counts[i]), float(y[i])) for i in range(57, 0, -4)]
         beside = ((-8, 6), (-8, -6), (8, 6), (8, -6), (0, 7), (0, -7))
-        name = shortened(line.name, 30)
+        name = folded(line.name, 30)
         notes.append(Note(name, places, readable(style.colour), "bold", beside))
     powers = range(round(log10(costs.most_queries)) + 1)
     axes.set_xticks([10**n for n in powers], [_power(n) for n in powers])
@@ -211,7 +211,7 @@ def draw_parts(axes: Axes, costs: Costs) -> None:
         note = axes.text(min(total, end), i, text, fontsize=NOTE, va="center", color=INK)
         if beyond:
             note.set(ha="right", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0})
-    axes.set_yticks(range(len(lines)), [plain(shortened(line.name, 30)) for line in lines])
+    axes.set_yticks(range(len(lines)), [plain(folded(line.name, 30)) for line in lines])
     for line, tick in zip(lines, axes.get_yticklabels(), strict=True):
         tick.set(color=readable(style_of(line.method).colour), fontweight="bold")
     axes.set_ylim(len(lines) - 0.4, -0.6)

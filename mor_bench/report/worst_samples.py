@@ -24,6 +24,7 @@ from mor_bench.report.canvas import (
     TICK,
     WIDTH_IN,
     Picture,
+    folded,
     length_unit,
     log_ticks,
     new_figure,
@@ -192,11 +193,11 @@ def _finding(samples: list[WorstSample]) -> str:
         return "No method predicts its worst sample"
     least, most = answered[0], answered[-1]
     unit, per_m = length_unit(most.largest_m)
-    text = f"Where its mean error e is largest, {shortened(least.entry.method, 30)} errs by up to "
+    text = f"Where its mean error e is largest, {shortened(least.entry.method)} errs by up to "
     text += f"{number(per_m * least.largest_m)} {unit}"
     if least is most:
         return text
-    return f"{text}, {shortened(most.entry.method, 30)} by {number(per_m * most.largest_m)} {unit}"
+    return f"{text}, {shortened(most.entry.method)} by {number(per_m * most.largest_m)} {unit}"
 
 
 def _read(comparison: Comparison, entry: Entry) -> WorstSample | None:
@@ -266,7 +267,7 @@ def _write_panel(
     if arrow is not None:
         start, end = VIEW.project(arrow)[0]
         _draw_force(axes, start, end, float(np.linalg.norm(sample.forces.sum(axis=0))))
-    title = plain(f"{shortened(name, 30)}\n{figures}")
+    title = plain(f"{folded(name, 30)}\n{figures}")
     axes.set_title(title, fontsize=NOTE, loc="left", color=INK)
 
 

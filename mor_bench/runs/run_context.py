@@ -96,6 +96,12 @@ class RunContext:
             settings["jobs"] = options.jobs
         return settings
 
+    def folders(self) -> dict[str, str]:
+        """Return the folders that the options name; a command that repeats the run names them."""
+        options = self.options
+        named = {"cache": options.cache, "suite": options.suite}
+        return {name: str(path.absolute()) for name, path in named.items() if path is not None}
+
 
 def training_options(options: TrainOptions, budget_s: float = float("inf")) -> TrainingOptions:
     """Return device and seconds of trainings.

@@ -13,6 +13,7 @@ from mor_bench.checked_files import read_bytes
 from mor_bench.checkout import source_commit
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.machine import describe_machine, gpu_name
+from mor_bench.options import FOLDERS
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.run_context import RunContext
 from mor_bench.sandbox.seal import isolation
@@ -60,6 +61,9 @@ def open_run(
         gpu = {"gpu": gpu_name()} if context.training.device == "cuda" else {}
         about = {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", **describe_machine()}
         comparison = Comparison(folder, {**about, **isolation(), **gpu}, settings=settings)
+    comparison.settings.pop(FOLDERS, None)
+    if folders := context.folders():
+        comparison.settings[FOLDERS] = folders
     record_commit(comparison.machine)
     comparison.methods |= {
         method.name: method.model_dump(mode="json", exclude={"folder"}) for method in methods
@@ -84,7 +88,7 @@ def _differences(kept: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
     return [
         f"`{name}` = {kept.get(name)!r} instead of {wanted.get(name)!r}"
         for name in dict.fromkeys([*kept, *wanted])
-        if kept.get(name) != wanted.get(name)
+        if name != FOLDERS and kept.get(name) != wanted.get(name)
     ]
 
 

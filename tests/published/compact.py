@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from math import inf
 from pathlib import Path
@@ -27,6 +28,7 @@ from mor_bench.analysis.selection_text import NO_RUNNER_UP, RUNNER_UP
 from mor_bench.analysis.verdict import RULE, Verdict, needs_of
 from mor_bench.measure.error_metrics import ERRORS as FIGURES
 from mor_bench.measure.error_metrics import SampleErrors, summary
+from mor_bench.options import FOLDERS
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.json_file import without_nan
 from mor_bench.results.row import Row
@@ -70,8 +72,11 @@ def compact(run: Path, folder: Path, shown: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("results.json", "comparison.json"):
         content = json.loads((run / name).read_text(encoding="utf-8"))
+        content.get("settings", {}).pop(FOLDERS, None)
         text = json.dumps(content, indent=None, separators=(",", ":"), allow_nan=False)
         text = text.replace(json.dumps(str(run))[1:-1], shown)
+        for name, path in comparison.settings.get(FOLDERS, {}).items():
+            text = text.replace(f" --{name} {json.dumps(shlex.quote(path))[1:-1]}", "")
         write_atomically(folder / name, (text + "\n").encode())
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="latest") as file:
