@@ -20,6 +20,7 @@ from mor_bench.report.canvas import (
     log_ticks,
     new_figure,
     plain,
+    shortened,
 )
 from mor_bench.report.entries import Analysis, Entry, entries_of
 from mor_bench.report.labels import Note, annotate
@@ -172,7 +173,7 @@ def draw_totals(axes: Axes, costs: Costs) -> None:
             mark.set_markeredgecolor(INK)
         places = [(float(counts[i]), float(y[i])) for i in range(57, 0, -4)]
         beside = ((-8, 6), (-8, -6), (8, 6), (8, -6), (0, 7), (0, -7))
-        name = folded(line.name, 30)
+        name = shortened(line.name)
         notes.append(Note(name, places, readable(style.colour), "bold", beside))
     powers = range(round(log10(costs.most_queries)) + 1)
     axes.set_xticks([10**n for n in powers], [_power(n) for n in powers])
