@@ -49,13 +49,20 @@ def measured(method: str) -> Iterator[tuple[str, Row]]:
 
 
 def picture(method: str, folder: Path) -> str | None:
-    """Draw the method's curve over the grey points of all others of its widest stored run."""
-    own = {run: [r for r in rows if r.method == method] for run, rows in stored_rows().items()}
+    """Draw the method's curve over the grey points of all others.
+
+    The stored run and dataset are those with most configurations of the method, and of these the
+    one with most rows.
+    """
+    found: dict[tuple[str, str], list[Row]] = {}
+    for run, rows in stored_rows().items():
+        for row in rows:
+            found.setdefault((run, row.dataset), []).append(row)
+    own = {place: sum(r.method == method for r in rows) for place, rows in found.items()}
     if not any(own.values()):
         return None
-    run = max(own, key=lambda name: (bool(own[name]), len(stored_rows()[name])))
-    dataset = own[run][0].dataset
-    points = [row for row in stored_rows()[run] if row.dataset == dataset]
+    place = max(found, key=lambda name: (own[name], len(found[name])))
+    points, dataset = found[place], place[1]
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
     others = [row for row in points if row.method != method]
     axes.plot(*_places(others), "o", color="#c8c8c8", ms=4, label="other methods")
@@ -71,11 +78,14 @@ def picture(method: str, folder: Path) -> str | None:
     return f"{method}.png"
 
 
+LEAST_ERROR = 1e-6
+"""Smaller errors, which are those of round-off, are drawn here."""
+
+
 def _places(rows: list[Row]) -> tuple[list[float], list[float]]:
-    shown = [row for row in rows if row.error and row.error.rel_l2_median > 1e-6]
     return (
-        [row.latency_ms.median for row in shown if row.latency_ms],
-        [100 * row.error.rel_l2_median for row in shown if row.error],
+        [row.latency_ms.median for row in rows if row.latency_ms],
+        [100 * max(row.error.rel_l2_median, LEAST_ERROR) for row in rows if row.error],
     )
 
 
@@ -109,7 +119,8 @@ def card_page(name: str, folder: Path, *, draw: bool = True) -> str:
     lines += ["## In short", "", *facts_of(name, card), "", *_hyperparameters(card)]
     lines += ["## Measured", "", "Errors are those of the test samples of each stored run.", ""]
     if draw and (shown := picture(name, folder)):
-        caption = f"Error over latency of {name}, with the other methods of the run in grey."
+        caption = f"Error over latency of {name}, with the other methods of the run in grey. "
+        caption += f"Errors below {100 * LEAST_ERROR:g} % are drawn there."
         lines += [f"![{caption}]({shown})", ""]
     lines += [*table(name), ""]
     target = spec.surrogate.replace(":", ".")
@@ -139,7 +150,7 @@ def _references(card: str) -> Iterator[str]:
         work = bibliography()[key]
         address = f"https://doi.org/{work['doi']}" if "doi" in work else work.get("url")
         if address:
-            yield f"- [{key}]: <{address}>"
+            yield f"- {key}: <{address}>"
 
 
 def measured_fit(method: str, dataset: str = "beam-coarse") -> str | None:
@@ -181,7 +192,7 @@ def index_page() -> str:
         "# Method cards",
         "",
         "Every method of the suite: its equation, its algorithm, its cost, where it fails, and its",
-        "measured curve. [Which method?](../which-method.md) helps to choose.",
+        "measured curve. {doc}`Which method? <../which-method>` helps to choose.",
         "",
     ]
     items = overview()["methods"]

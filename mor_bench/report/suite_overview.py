@@ -100,6 +100,7 @@ def method_family(spec: MethodSpec) -> str:
 
 def method_needs(spec: MethodSpec) -> str:
     """State what a method needs, such as "equations, snapshots"."""
-    parts: list[Any] = [TOLD[spec.told], "snapshots" if spec.snapshots else ""]
+    told = "observed displacements" if spec.observed else TOLD[spec.told]
+    parts: list[Any] = [told, "snapshots" if spec.snapshots else ""]
     parts.append(f"[{spec.extra}]" if spec.extra else "")
     return ", ".join(filter(None, parts))

@@ -74,6 +74,8 @@ class MethodSpec(StrictModel):
         Whether the method learns from snapshots with the parameters of the file.
     extra : str, optional
         Extra of mor-bench that the method needs.
+    observed : bool
+        Whether the method only handles scenes in which displacements are observed.
     reference : bool
         Whether the method solves the full equations on the dataset's own mesh. Its error is then
         that of its tolerance.
@@ -98,6 +100,7 @@ class MethodSpec(StrictModel):
     told: Told | None = None
     snapshots: bool = True
     extra: Literal["learn", "mkl", "pymor"] | None = None
+    observed: bool = Field(default=False, exclude_if=lambda value: not value)
     reference: bool = False
     limits: Text = ""
     regime: Regime | None = None

@@ -10,8 +10,10 @@ benchmarks.
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
+import tempfile
 from pathlib import Path
 
 from mor_bench.errors import MorBenchError
@@ -88,10 +90,24 @@ def publish_history(html: Path) -> None:
 
     config = Config.load(str(HISTORY))
     config.repo = str(ROOT)
-    config.results_dir = str(ROOT / "reports" / "asv")
     config.html_dir = str(html)
-    Publish.run(config, pull=False)
+    with tempfile.TemporaryDirectory() as folder:
+        results = Path(folder) / "asv"
+        shutil.copytree(ROOT / "reports" / "asv", results)
+        keep_measured(results)
+        config.results_dir = str(results)
+        Publish.run(config, pull=False)
     make_offline(html)
+
+
+def keep_measured(results: Path) -> None:
+    """Take the benchmarks that no commit has a value of out of the list that asv shows."""
+    path = results / "benchmarks.json"
+    listed = json.loads(path.read_text(encoding="utf-8"))
+    stored = [json.loads(each.read_text(encoding="utf-8")) for each in results.glob("*/*-*.json")]
+    measured = {name for content in stored for name in content["results"]}
+    kept = {name: each for name, each in listed.items() if name in {"version", *measured}}
+    path.write_text(json.dumps(kept), encoding="utf-8")
 
 
 if __name__ == "__main__":

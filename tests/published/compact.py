@@ -75,8 +75,8 @@ def compact(run: Path, folder: Path, shown: str) -> None:
         content.get("settings", {}).pop(FOLDERS, None)
         text = json.dumps(content, indent=None, separators=(",", ":"), allow_nan=False)
         text = text.replace(json.dumps(str(run))[1:-1], shown)
-        for name, path in comparison.settings.get(FOLDERS, {}).items():
-            text = text.replace(f" --{name} {json.dumps(shlex.quote(path))[1:-1]}", "")
+        for option, path in comparison.settings.get(FOLDERS, {}).items():
+            text = text.replace(f" --{option} {json.dumps(shlex.quote(path))[1:-1]}", "")
         write_atomically(folder / name, (text + "\n").encode())
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="latest") as file:
