@@ -1,7 +1,8 @@
 """Commands and blocks of Python in the documentation: they parse, and the names in them exist.
 
 A block of Python runs when its page is built (`{code-cell}`), or in a test (`<!-- python -->`, see
-`test_own_data_guide.py`). Any other block is marked `<!-- excerpt -->`, and is checked here.
+`test_own_data_guide.py`). Any other block is marked `<!-- excerpt -->`. Its names are checked here,
+and a slow test runs it on few samples.
 """
 
 from __future__ import annotations
@@ -9,10 +10,14 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 
@@ -20,6 +25,7 @@ import mor_bench
 from mor_bench.cli.app import app
 from mor_bench.specs.suite_folder import list_suite
 from tests.published.stored import ROOT
+from tests.small_runs import short_timing
 
 UsageError = typer.BadParameter.__mro__[1]
 
@@ -111,6 +117,34 @@ def test_every_block_of_python_is_run_or_is_an_excerpt_of_names_that_exist(
     for node in ast.walk(ast.parse(block)):
         if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "mor_bench":
             assert hasattr(mor_bench, node.attr)
+
+
+EXCERPTS = [(page, block) for page, mark, block in BLOCKS if mark == "excerpt"]
+
+LIMIT = 60
+"""Samples of a dataset while an excerpt runs."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "block"), EXCERPTS)
+def test_every_excerpt_runs(
+    page: str, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "Comparison.read" not in block:
+        monkeypatch.chdir(tmp_path)
+    cache = tmp_path / "cache"
+    for name, few in (("load_dataset", {"limit": LIMIT}), ("run", {"limit": LIMIT})):
+        function: Any = getattr(mor_bench, name)
+        monkeypatch.setattr(mor_bench, name, partial(function, cache=cache, **few))
+    module = ModuleType("excerpt")
+    vars(module).update(np=np, mor_bench=mor_bench)
+    monkeypatch.setitem(sys.modules, "excerpt", module)  # where dataclasses look themselves up
+    with short_timing():
+        exec(compile(block, page, "exec"), vars(module))
+
+
+def test_there_are_excerpts() -> None:
+    assert len(EXCERPTS) > 8
 
 
 def test_no_page_installs_the_unpublished_package_by_name() -> None:

@@ -56,6 +56,14 @@ class ObservedDisplacements(_NodalValues):
         Displacements, m. Methods ignore the values at other nodes; they may be NaN.
     nodes : (n_observed,) int64
         The observed nodes, `Scene.observed_nodes`.
+
+    Examples
+    --------
+    >>> values = np.full((4, 3), np.nan)
+    >>> values[[1, 3]] = 0.001
+    >>> observed = ObservedDisplacements(values, np.array([1, 3]))
+    >>> observed.query.values[observed.nodes].shape
+    (2, 3)
     """
 
     nodes: NDArray[np.int64]
