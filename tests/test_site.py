@@ -42,6 +42,21 @@ def test_every_method_page_says_where_the_method_fails(tmp_path: Path) -> None:
         assert said == " ".join(load_method_spec(name).limits.split())
 
 
+def test_cards_link_to_the_works_that_they_cite(tmp_path: Path) -> None:
+    pytest.importorskip("sphinx", reason="needs the extra `docs`")
+    import method_cards
+
+    for name in list_suite("methods"):
+        page = method_cards.card_page(name, tmp_path, draw=False)
+        text = (CARDS / f"{name}.md").read_text(encoding="utf-8")
+        cited = set(re.findall(r"\{cite\}`(\w+)`", text))
+        known = {key for key in cited if {"doi", "url"} & set(method_cards.bibliography()[key])}
+        assert known, name
+        for key in known:
+            # A key in brackets would be a definition of a link, which Markdown does not show.
+            assert re.search(rf"^- {key}: <https://\S+>$", page, re.MULTILINE), (name, key)
+
+
 def test_stated_costs_of_fits_are_near_the_stored_ones() -> None:
     pytest.importorskip("sphinx", reason="needs the extra `docs`")
     import method_cards
