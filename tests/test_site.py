@@ -49,8 +49,8 @@ def test_cards_link_to_the_works_that_they_cite(tmp_path: Path) -> None:
     for name in list_suite("methods"):
         page = method_cards.card_page(name, tmp_path, draw=False)
         text = (CARDS / f"{name}.md").read_text(encoding="utf-8")
-        cited = set(re.findall(r"\{cite\}`(\w+)`", text))
-        known = {key for key in cited if {"doi", "url"} & set(method_cards.bibliography()[key])}
+        works = {key: method_cards.bibliography()[key] for key in method_cards.cited(text)}
+        known = [key for key, work in works.items() if {"doi", "url"} & set(work)]
         assert known, name
         for key in known:
             # A key in brackets would be a definition of a link, which Markdown does not show.

@@ -144,9 +144,15 @@ def bibliography() -> dict[str, dict[str, str]]:
     return {entry["key"]: dict(FIELD.findall(entry["fields"])) for entry in ENTRY.finditer(text)}
 
 
+def cited(card: str) -> list[str]:
+    """Return the keys of the works that a card cites; one citation may have several."""
+    groups = re.findall(r"\{cite\}`([^`]+)`", card)
+    return list(dict.fromkeys(key.strip() for group in groups for key in group.split(",")))
+
+
 def _references(card: str) -> Iterator[str]:
     """List the works that a card cites, each with a link."""
-    for key in dict.fromkeys(re.findall(r"\{cite\}`(\w+)`", card)):
+    for key in cited(card):
         work = bibliography()[key]
         address = f"https://doi.org/{work['doi']}" if "doi" in work else work.get("url")
         if address:
