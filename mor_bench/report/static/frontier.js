@@ -199,24 +199,38 @@ Report.kinds.frontier = (figure, data) => {
   const AWAY = [26, 42, 58, 74, 90, 106, 122, 138];
   const BESIDE = [0, 0.5, -0.5, 1, -1];
 
-  // Values beyond the axis stand at its edge, with an arrow and the value. Such a label covers no
-  // text in `taken`, and markers only where there is no other place; without a place it is left out.
+  // Small boxes along the arrow from a label's centre to its marker, outside the label.
+  const arrowOf = ([px, py], [lx, ly]) => [0.3, 0.4, 0.5, 0.6, 0.7, 0.8].map(
+    (part) => boxAt([lx + part * (px - lx), ly + part * (py - ly)], 4, 4),
+  );
+
+  // Values beyond the axis stand at its edge, with an arrow and the value. Such a label and its arrow
+  // cover no text or arrow in `taken`, and markers only where there is no other place; without a
+  // place it is left out.
   function cuts(rows, range, taken, front) {
+    const cut = rows.filter((row) => y(row) > TOP || y(row) < FLOOR);
     const markers = rows.map((row) => boxAt(pixels(row, range), 12, 12));
-    return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).flatMap((row) => {
+    // The way of each arrow, which the labels of the others leave free if they can.
+    const ways = cut.map((row) => {
+      const [px, py] = pixels(row, range);
+      return boxAt([px, py - (y(row) > TOP ? 1 : -1) * 26], 12, 40);
+    });
+    return cut.flatMap((row, number) => {
+      const avoided = [...markers, ...ways.filter((_, other) => other !== number)];
       const value = `${R.short(y(row))} %`;
       const text = !R.isNarrow() ? `${row.name}: ${value}`
         : front.includes(row) ? `${front.indexOf(row) + 1}: ${value}` : value;
       const side = y(row) > TOP ? 1 : -1, [px, py] = pixels(row, range), width = R.widthOf(text, 11) + 6;
       const places = AWAY.flatMap((away) => BESIDE.map((part) => {
         const shift = part * width;
-        const box = boxAt([px + shift, py - side * away], width, 19);
-        return { shift, away, box, covered: markers.filter((marker) => overlap(box, marker)).length };
-      })).filter(({ box }) => box[0] >= 0 && box[1] >= 0 && box[2] <= size[0] && box[3] <= size[1]
-        && !taken.some((other) => overlap(box, other)));
+        const centre = [px + shift, py - side * away], box = boxAt(centre, width, 19);
+        const arrow = arrowOf([px, py], centre);
+        return { shift, away, box, arrow, covered: avoided.filter((other) => overlap(box, other)).length };
+      })).filter(({ box, arrow }) => box[0] >= 0 && box[1] >= 0 && box[2] <= size[0] && box[3] <= size[1]
+        && !taken.some((other) => overlap(box, other) || arrow.some((part) => overlap(part, other))));
       if (!places.length) return [];
       const best = places.reduce((a, b) => (b.covered < a.covered ? b : a));
-      taken.push(best.box);
+      taken.push(best.box, ...best.arrow);
       return [{
         x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: best.shift, ay: side * best.away,
         text: R.plain(text),

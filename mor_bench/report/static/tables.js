@@ -66,7 +66,7 @@ Report.table = (grid, data) => {
     columnHeaderSortMulti: false,
     columns: [
       { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: narrow ? 136 : 150, widthGrow: 2 },
-      { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: narrow ? 106 : 126, ...numbers },
+      { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: narrow ? 114 : 126, ...numbers },
       { title: "latency (ms)", field: "latency_value", formatter: figureCell("latency"), minWidth: 112, ...numbers },
       { title: "offline (core\u2011s)", field: "offline", formatter: figureCell("offline"), minWidth: 96, ...numbers },
       { title: "told", field: "group", formatter: textCell, minWidth: narrow ? 200 : 150, widthGrow: 2 },
