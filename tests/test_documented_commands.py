@@ -133,9 +133,9 @@ def test_every_excerpt_runs(
     if "Comparison.read" not in block:
         monkeypatch.chdir(tmp_path)
     cache = tmp_path / "cache"
-    for name, few in (("load_dataset", {"limit": LIMIT}), ("run", {"limit": LIMIT})):
+    for name in ("load_dataset", "run"):
         function: Any = getattr(mor_bench, name)
-        monkeypatch.setattr(mor_bench, name, partial(function, cache=cache, **few))
+        monkeypatch.setattr(mor_bench, name, partial(function, cache=cache, limit=LIMIT))
     module = ModuleType("excerpt")
     vars(module).update(np=np, mor_bench=mor_bench)
     monkeypatch.setitem(sys.modules, "excerpt", module)  # where dataclasses look themselves up

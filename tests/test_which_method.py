@@ -70,6 +70,9 @@ def test_the_page_is_right_about_observed_displacements() -> None:
     assert run.analysis
     (verdict,) = run.analysis["verdicts"]
     assert verdict["choice"].startswith("gappy-pod")
+    (choice,) = (row for row in run.rows if row.label == verdict["choice"])
+    assert choice.error
+    assert choice.error.rel_l2_median > run.datasets[observed[0][1]]["needs"]["error"]
     modes = [row for row in run.rows if row.method == "gappy-pod"]
     errors = [row.error.rel_l2_median for row in modes if row.error]
     latencies = [row.latency_ms.median for row in modes if row.latency_ms]

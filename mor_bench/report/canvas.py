@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from mor_bench.report import line_wrapping
 from mor_bench.report.line_wrapping import KEPT
 from mor_bench.report.number_format import joined_units
 from mor_bench.results.comparison import Comparison
@@ -271,6 +271,5 @@ def shortened(name: str) -> str:
 
 def folded(name: str, width: int) -> str:
     """Break the name of a configuration into lines, between its values where possible."""
-    kept = re.sub(r"(?<=[\w.]) (?=[\w.])", KEPT, shortened(name))
-    lines = textwrap.wrap(kept, width, break_on_hyphens=False)
-    return "\n".join(lines).replace(KEPT, " ")
+    name = shortened(name)
+    return "\n".join(line_wrapping.wrapped(name, width, names=re.split(" · |, ", name)))

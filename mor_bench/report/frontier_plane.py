@@ -141,7 +141,11 @@ def series_of(shown: Sequence[Entry]) -> list[Series]:
     for method in dict.fromkeys(e.method for e in shown):
         groups = lines_of([e for e in shown if e.method == method])
         found += [
-            Series(shortened(f"{method}, {text}" if text else method), members, LINES[i % 4][0])
+            Series(
+                shortened(f"{method}, {text}" if text else method),
+                members,
+                LINES[i % len(LINES)][0],
+            )
             for i, (text, members) in enumerate(groups.items())
         ]
     return found

@@ -65,7 +65,8 @@ class Comparison:
     analysis : dict or None
         Content of comparison.json, once `finish` has written it.
     settings : dict
-        Profile, split, limit, threads, budgets and version of the run.
+        Profile, split, limit, threads, budgets and version of the run, and `folders`, those that
+        its command named.
     """
 
     out: Path
