@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from mor_bench.report.number_format import MEANINGS, short_name
 from mor_bench.report.short_names import constants, short_names
+from mor_bench.specs import list_suite, load_method_spec
 from tests.synthetic import a_row
 
 
@@ -33,3 +35,11 @@ def test_parameters_with_one_initial_keep_their_names_apart() -> None:
 def test_values_that_round_to_one_text_stay_apart() -> None:
     rows = [a_row("a", {"tolerance": t}) for t in (0.1, 0.1000000001)]
     assert str(short_names(rows)[rows[1].label]) == "a · tolerance=0.1000000001"
+
+
+def test_every_short_name_of_the_suite_has_a_meaning() -> None:
+    specs = [load_method_spec(name) for name in list_suite("methods")]
+    sweeps = [s for spec in specs for s in (spec.sweep, *(p.sweep for p in spec.profiles.values()))]
+    keys = {key for sweep in sweeps for key in sweep if short_name(key) != key}
+    assert len(keys) > 8
+    assert keys <= set(MEANINGS)
