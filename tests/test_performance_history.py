@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -17,6 +18,7 @@ from tests.benchmarks import asv_history
 from tests.benchmarks.asv_history import (
     RESULTS,
     ROOT,
+    chosen,
     farthest_first,
     import_digests,
     spread,
@@ -128,14 +130,24 @@ def test_a_single_commit_is_not_shown(tmp_path: Path) -> None:
 
 def test_commits_are_spread_evenly_and_a_part_of_a_run_covers_the_whole_history() -> None:
     commits = [str(i) for i in range(101)]
-    chosen = spread(commits, 11)
-    assert chosen == [str(10 * i) for i in range(11)]
+    few = spread(commits, 11)
+    assert few == [str(10 * i) for i in range(11)]
     assert spread(commits, 1) == ["100"]
     assert spread(commits, 500) == commits
-    assert list(farthest_first(chosen, set()))[:4] == ["100", "0", "50", "80"]
-    rest = list(farthest_first(chosen, {"0", "50", "60"}))
+    assert list(farthest_first(few, set()))[:4] == ["100", "0", "50", "80"]
+    rest = list(farthest_first(few, {"0", "50", "60"}))
     assert rest[:2] == ["100", "80"]
-    assert sorted(rest) == sorted(set(chosen) - {"0", "50", "60"})
+    assert sorted(rest) == sorted(set(few) - {"0", "50", "60"})
+
+
+def test_the_newest_fifty_commits_are_chosen_and_twelve_before() -> None:
+    commits = [str(i) for i in range(400)]
+    assert chosen(commits)[12:] == commits[350:]
+    older = [int(commit) for commit in chosen(commits)[:12]]
+    assert older[0] == 0
+    assert older[-1] == 349
+    assert {b - a for a, b in itertools.pairwise(older)} <= {31, 32}
+    assert chosen(commits[:30]) == commits[:30]
 
 
 def test_a_module_is_compiled_again_if_one_that_it_imports_has_changed(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ asv would build an environment per commit, which takes too long with torch. Here
 holds each commit in turn, and asv runs with `--set-commit-hash`. Results go to `reports/asv`, in
 asv's format. A commit with a file there is skipped, so a run that was stopped goes on.
 
-Commits are spread evenly over those on the first-parent line that changed `mor_bench/`.
+Of the commits on the first-parent line that changed `mor_bench/`, the newest fifty are measured, and
+twelve that are spread evenly over those before.
 
 Numba keeps compiled kernels between commits. It recompiles a function if its file has another time
 of modification, but ignores the files which that file imports. So the time of each file is set to
@@ -36,7 +37,7 @@ MACHINE = "shared-2-cores"
 """Name of the machine in the stored results; a host's own name says nothing to a reader."""
 
 ENVIRONMENT = "existing-py{}"
-N_COMMITS = 50
+N_NEWEST, N_OLDER = 50, 12
 
 
 def git(*arguments: str, folder: Path = ROOT) -> str:
@@ -57,6 +58,11 @@ def spread(commits: list[str], n: int) -> list[str]:
     if n == 1:
         return commits[-1:]
     return [commits[round(i * (len(commits) - 1) / (n - 1))] for i in range(n)]
+
+
+def chosen(commits: list[str]) -> list[str]:
+    """Choose the newest commits, and some spread over the older ones; oldest first."""
+    return spread(commits[:-N_NEWEST], N_OLDER) + commits[-N_NEWEST:]
 
 
 def farthest_first(commits: list[str], done: Set[str]) -> Iterator[str]:
@@ -182,11 +188,11 @@ def without_paths(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def wanted(arguments: argparse.Namespace) -> Iterator[str]:
-    """Yield the commits to measure: those given, or the spread ones without a result."""
+    """Yield the commits to measure: those given, or the chosen ones without a result."""
     if arguments.commit:
         yield from (git("rev-parse", f"{name}^{{commit}}") for name in arguments.commit)
         return
-    commits = spread(candidates(), arguments.commits)
+    commits = chosen(candidates())
     done = {commit for commit in commits if result_file(commit).exists()}
     yield from farthest_first(commits, done)
 
@@ -194,7 +200,6 @@ def wanted(arguments: argparse.Namespace) -> Iterator[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--commit", action="append", help="measure this commit; may be repeated")
-    parser.add_argument("--commits", type=int, default=N_COMMITS, help="number of commits")
     parser.add_argument("--minutes", type=float, default=60.0, help="start no commit after this")
     parser.add_argument("--work", type=Path, default=ROOT / ".asv" / "history-work")
     parser.add_argument("--list", action="store_true", help="list the commits and stop")
