@@ -10,7 +10,6 @@ from math import pi, sqrt
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mor_bench.errors import OutsideMeshError, SpecError, UnsupportedSceneError
 from mor_bench.scene.interpolation import interpolation_matrix, rows_to_one
@@ -24,6 +23,7 @@ from mor_bench.scene.loads import (
     spread_out,
 )
 from mor_bench.scene.mesh import Mesh
+from mor_bench.scene.nearest import tree_of
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.specs import (
     AnyTable,
@@ -118,7 +118,7 @@ class Acting:
         points = surface.points[region]
         if isinstance(plan, Loads) and len(self.ground.fixed_nodes):
             fixed = self.ground.mesh.points[self.ground.fixed_nodes]
-            distance = cKDTree(fixed).query(points)[0]
+            distance = tree_of(fixed).query(points)[0]
             region = region[distance > sqrt(plan.patch_area_m2 / pi)]
         if plan.n_patches > len(region):
             raise SpecError(

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mor_bench.errors import OutsideMeshError
 from mor_bench.scene.mesh import HEX_CORNERS, TET_EDGES, Mesh
+from mor_bench.scene.nearest import tree_of
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 OUTSIDE = 1e-9
 """Tolerance for a point outside its cell, in reference coordinates; far above round-off."""
@@ -122,7 +125,7 @@ def _searchable(mesh: Mesh) -> _Cells:
     margin = 1e-6 * np.linalg.norm(high - low, axis=1).max()
     centres = corners.mean(axis=1)
     reach = float(np.linalg.norm(hull - centres[:, None], axis=2).max()) + margin
-    return _Cells(corners, low - margin, high + margin, cKDTree(centres), reach)
+    return _Cells(corners, low - margin, high + margin, tree_of(centres), reach)
 
 
 def interpolation_matrix(mesh: Mesh, points: NDArray[np.float64]) -> sp.csr_array:

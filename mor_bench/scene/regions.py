@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError
+from mor_bench.scene.nearest import tree_of
 from mor_bench.specs import (
     BoxRegion,
     NearestRegion,
@@ -110,7 +110,7 @@ def _nearest(cloud: Cloud, region: NearestRegion) -> NDArray[np.int64]:
             f"`nearest_m` must ask for at most {len(cloud.on_surface)} nodes, the number "
             f"of nodes on the surface; got {n}."
         )
-    tree = cKDTree(cloud.points[cloud.on_surface])
+    tree = tree_of(cloud.points[cloud.on_surface])
     return np.asarray(cloud.on_surface[tree.query(point, k=[*range(1, n + 1)])[1]])
 
 

@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.interpolation import quadratic, trilinear
@@ -21,6 +19,7 @@ from mor_bench.scene.mesh import (
     corners_of,
     inverse_of,
 )
+from mor_bench.scene.nearest import tree_of
 
 SAME_PLACE = 1e-9
 """Distance below which two nodes coincide, as a fraction of the bounding box's diagonal."""
@@ -135,7 +134,7 @@ def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArra
         an edge of T10 has several middles, or another cell's corner in the middle.
     """
     near = SAME_PLACE * float(np.linalg.norm(np.ptp(points, axis=0)))
-    tree = cKDTree(points)
+    tree = tree_of(points)
     if (n_near := int(tree.count_neighbors(tree, near)) - len(points)) > MAX_LISTED:
         raise SpecError(f"{n_near:,} pairs of nodes coincide; merge them.")
     if n_near:
@@ -231,6 +230,8 @@ def _check_middles(cells: NDArray[np.int64]) -> None:
 
 def _check_parts(faces: NDArray[np.int64]) -> None:
     """Raise `SpecError` if some cells are not connected through faces. An edge is a hinge."""
+    from scipy.sparse.csgraph import connected_components  # slow to import; datasets are sound
+
     cell = np.repeat(np.arange(len(faces)), faces.shape[1])
     belongs = sp.csr_array((np.ones(faces.size), (cell, faces.ravel())))
     n_parts = connected_components(sp.csr_array(belongs @ belongs.T), directed=False)[0]

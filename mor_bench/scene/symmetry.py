@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.materials import HolzapfelGasserOgden, Material
+from mor_bench.scene.nearest import tree_of
 from mor_bench.scene.scene import Scene
 
 SAME_PLACE = 1e-6
@@ -50,7 +50,7 @@ def mirrors(scene: Scene) -> list[Mirror]:
     points, cells = scene.mesh.points, scene.mesh.cells
     low, high = points.min(axis=0), points.max(axis=0)
     near = SAME_PLACE * np.linalg.norm(high - low)
-    tree = cKDTree(points)
+    tree = tree_of(points)
     own_cells = _rows(cells)
     held = [scene.fixed_dofs[scene.fixed_dofs % 3 == i] // 3 for i in range(3)]
     kept = *held, np.unique(scene.patch_weights.indices)
