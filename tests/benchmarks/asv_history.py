@@ -8,8 +8,8 @@ asv would build an environment per commit, which takes too long with torch. Here
 holds each commit in turn, and asv runs with `--set-commit-hash`. Results go to `reports/asv`, in
 asv's format. A commit with a file there is skipped, so a run that was stopped goes on.
 
-Of the commits on the first-parent line that changed `mor_bench/`, the newest fifty are measured, and
-twelve that are spread evenly over those before.
+Of the commits on the first-parent line that changed `mor_bench/`, the newest fifty are measured,
+and twelve that are spread evenly over those before.
 
 Numba keeps compiled kernels between commits. It recompiles a function if its file has another time
 of modification, but ignores the files which that file imports. So the time of each file is set to
