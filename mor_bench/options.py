@@ -229,7 +229,10 @@ class FitOptions(TrainOptions):
 
 
 FOLDERS = "folders"
-"""Entry of a run's settings for the folders that its command named; a resumed run may change it."""
+"""Entry of a run's settings for the folders and datasets' files that its command named.
+
+A resumed run may change it.
+"""
 
 DEFAULT_SEEDS: dict[str, int] = {"quick": 1, "full": 3}
 """Number of trainings of a configuration that has a seed, by profile."""

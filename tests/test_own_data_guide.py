@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 import mor_bench
+from mor_bench.analysis.selection import asked_of
+from mor_bench.analysis.selection_text import run_command
 from mor_bench.runs.file_check import check_file
 from mor_bench.scene.snapshot_file import OPTIONAL, REQUIRED
 from tests.small_runs import PLAIN, short_timing
@@ -44,6 +46,8 @@ def test_the_imported_dataset_of_the_guide_can_be_compared(folder: Path) -> None
     with short_timing():
         comparison = mor_bench.run(["mine.toml"], PLAIN, out="out", cache="cache")
     assert {row.status for row in comparison.rows} == {"skipped", "ok"}
+    command = run_command(asked_of(comparison, "mine"))
+    assert command.startswith("mor-bench run mine.toml -m linear-fem -m pca-regression ")
 
 
 def test_the_guide_names_every_array_of_the_schema() -> None:

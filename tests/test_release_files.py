@@ -43,7 +43,7 @@ def test_the_citation_has_what_the_format_requires() -> None:
 
 def test_the_workflow_runs_on_three_systems_and_names_files_that_exist() -> None:
     jobs = parsed(".github/workflows/ci.yml")["jobs"]
-    assert {"tests", "lint", "site", "benchmarks", "wheel"} == set(jobs)
+    assert {"tests", "lint", "site", "benchmarks", "container", "wheel"} == set(jobs)
     for name in ("tests", "wheel"):
         systems = {system.split("-")[0] for system in jobs[name]["strategy"]["matrix"]["os"]}
         assert systems == {"ubuntu", "macos", "windows"}

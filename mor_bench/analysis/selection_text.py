@@ -242,9 +242,10 @@ def run_command(asked: Mapping[str, Any]) -> str:
     settings = dict(asked)
     budget, folders = settings.pop("budget", None) or {}, settings.pop(FOLDERS, None) or {}
     profile = settings.get("profile") or RunOptions().profile
-    given = {**settings, **folders, "time_limit_s": budget.get("seconds")}
+    given = {**folders, **settings, "time_limit_s": budget.get("seconds")}
     usual = {"seeds": DEFAULT_SEEDS[profile], "time_limit_s": DEFAULT_TIME_LIMIT_S[profile]}
-    words = ["mor-bench", "run", *settings["datasets"]]
+    files = folders.get("datasets", {})
+    words = ["mor-bench", "run", *(files.get(name, name) for name in settings["datasets"])]
     words += [word for name in settings.get("methods", ()) for word in ("-m", name)]
     for name, field, line in command_line(RunOptions):
         value = given.get(name)

@@ -81,7 +81,12 @@ def run(
     context = RunContext.of(RunOptions(profile=profile, **options), listener)
     specs, methods_found, _ = checked_specs(datasets, methods, context.options)
     _check_test_seed(context.options.test_seed, specs)
-    comparison = open_run(out, specs, methods_found, context)
+    files = {
+        spec.name: str(given)
+        for given, spec in zip(datasets, specs, strict=True)
+        if not isinstance(given, Mapping) and str(given) != spec.name and Path(given).is_file()
+    }
+    comparison = open_run(out, specs, methods_found, context, files)
     configurations = configurations_of(methods_found, profile, context.training)
     with only_run_in(comparison.out):
         with ExitStack() as stack:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,8 +32,11 @@ def open_run(
     specs: Sequence[AnyDatasetSpec],
     methods: Sequence[MethodSpec],
     context: RunContext,
+    files: Mapping[str, str],
 ) -> Comparison:
     """Make the comparison in a folder, or resume one with the same settings and datasets.
+
+    ``files`` has the paths of datasets that were given by their files, by name.
 
     Raises
     ------
@@ -62,7 +65,7 @@ def open_run(
         about = {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", **describe_machine()}
         comparison = Comparison(folder, {**about, **isolation(), **gpu}, settings=settings)
     comparison.settings.pop(FOLDERS, None)
-    if folders := context.folders():
+    if folders := {**context.folders(), **({"datasets": dict(files)} if files else {})}:
         comparison.settings[FOLDERS] = folders
     record_commit(comparison.machine)
     comparison.methods |= {

@@ -76,6 +76,8 @@ def compact(run: Path, folder: Path, shown: str) -> None:
         text = json.dumps(content, indent=None, separators=(",", ":"), allow_nan=False)
         text = text.replace(json.dumps(str(run))[1:-1], shown)
         for option, path in comparison.settings.get(FOLDERS, {}).items():
+            if option == "datasets":  # published runs are of the suite's datasets
+                continue
             text = text.replace(f" --{option} {json.dumps(shlex.quote(path))[1:-1]}", "")
         write_atomically(folder / name, (text + "\n").encode())
     buffer = io.BytesIO()
