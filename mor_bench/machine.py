@@ -24,6 +24,13 @@ Linux may deliver a signal to any thread. Python acts on it only when the main t
 """
 
 
+def usable_cores() -> int:
+    """Return the number of cores that this process may use; a queue or container may allow few."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 @contextmanager
 def pinned_threads(threads: int) -> Iterator[None]:
     """Limit the threads of BLAS, OpenMP and, if it is loaded, torch."""
@@ -135,7 +142,7 @@ def describe_machine() -> dict[str, Any]:
     return {
         "processor": _processor(),
         "processor_model": _processor_model(),
-        "cores": os.cpu_count() or 1,
+        "cores": usable_cores(),
         "memory_bytes": int(psutil.virtual_memory().total),
         "load": [round(load, 2) for load in psutil.getloadavg()],
         "system": f"{platform.system()} {platform.release()}",

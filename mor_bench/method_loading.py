@@ -21,6 +21,7 @@ from mor_bench.errors import (
 from mor_bench.model_file import StoredModel, class_path, read_model
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.specs import (
     check_parameters,
@@ -99,7 +100,8 @@ class AdaptedMethod(Surrogate):
     Parameters
     ----------
     adapted : type
-        A class with the methods ``fit(scene, snapshots)`` and ``predict(forces)``. Its attributes
+        A class with the methods ``fit(scene, snapshots)`` and ``predict(forces)``, which gets
+        forces (n, n_nodes, 3), N, and returns displacements of that shape, m. Its attributes
         `needs_snapshots` (default True) and `takes_observations` (default False) are used.
     parameters : dict
         Its checked hyperparameters.
@@ -137,7 +139,13 @@ class AdaptedMethod(Surrogate):
             raise UnsupportedSceneError(f"{class_path(self._class)}: {NO_PARAMETERS}.")
         if not hasattr(self, "method_"):
             raise NotFittedError(f"{class_path(self._class)} must be fitted before it predicts.")
-        return np.asarray(self.method_.predict(forces))
+        if isinstance(forces, ObservedDisplacements):
+            return np.asarray(self.method_.predict(forces))
+        given = np.asarray(forces)
+        if given.ndim != 2:
+            return np.asarray(self.method_.predict(given))
+        found = np.asarray(self.method_.predict(given[None]))
+        return found[0] if found.shape == (1, *given.shape) else found
 
     def save(self, path: str | Path) -> None:
         raise MorBenchError(

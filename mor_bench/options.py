@@ -14,7 +14,6 @@ mor_bench.options.InvalidOptionError: unknown option `sed`; did you mean 'seeds'
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +31,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from mor_bench.errors import InvalidInputError
+from mor_bench.machine import usable_cores
 from mor_bench.specs.base import MAX_COUNT
 from mor_bench.specs.one_line_errors import nearest_name
 from mor_bench.specs.parameters import python_number
@@ -40,7 +40,7 @@ from mor_bench.specs.split_spec import SplitBy
 Device = Literal["auto", "cpu", "cuda"]
 Profile = Literal["quick", "full"]
 
-CORES = os.cpu_count() or 1
+CORES = usable_cores()
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ Tree = dict[str, str]
 FLOORS = (
     (
         "errors",
+        "compile_clock",
         "counting",
         "digests",
         "machine",

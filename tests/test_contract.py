@@ -253,6 +253,7 @@ def test_a_plain_class_with_fit_and_predict_is_adapted(tiny: Dataset, tmp_path: 
         method.predict(tiny.test.forces[0])
     method.fit(tiny.scene, tiny.train)
     np.testing.assert_array_equal(method.predict(tiny.test.forces[:2]), 2 * tiny.test.forces[:2])
+    np.testing.assert_array_equal(method.predict(tiny.test.forces[0]), 2 * tiny.test.forces[0])
     assert method.out_of_range(100 * tiny.test.forces).all()
     with pytest.raises(MorBenchError, match="cannot be saved"):
         method.save(tmp_path / "model.safetensors")

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numba import njit
+from numba.core.event import Event, EventStatus
 from numpy.typing import NDArray
 
+from mor_bench.compile_clock import CompileClock
 from mor_bench.measure.fit_clock import fit_clock
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.snapshots.generate import generate, generation_seconds, n_samples_to_generate
@@ -60,6 +62,36 @@ def test_compilation_is_part_of_neither_time() -> None:
         assert summed(4) == 14
     assert cost.compile_s > 0
     assert max(cost.wall_s, cost.core_s) < 0.5 * cost.compile_s
+
+
+def test_the_clock_of_compilation_counts_nested_ones_once_and_waiting_as_wall_time_only() -> None:
+    clock, event = CompileClock(), Event("numba:compile", EventStatus.START)  # type: ignore[no-untyped-call]
+    clock.on_start(event)
+    clock.on_start(event)
+    sleep(BUSY_S)
+    clock.on_end(event)
+    assert clock.wall_s == 0.0
+    clock.on_end(event)
+    assert BUSY_S <= clock.wall_s < 2 * BUSY_S + 1.0
+    assert clock.core_s < 0.5 * BUSY_S
+
+
+def test_waiting_is_no_part_of_the_cost_of_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solve_many, waited = FullOrderModel.solve_many, list[float]()
+
+    def wait_and_solve(self: FullOrderModel, *arguments: Any) -> Any:
+        sleep(2.0)
+        waited.append(2.0)
+        return solve_many(self, *arguments)
+
+    monkeypatch.setattr(FullOrderModel, "solve_many", wait_and_solve)
+    spec = load_generated_spec("beam-tiny")
+    generate(spec, workers=1, cache=tmp_path)
+    seconds = generation_seconds(spec, tmp_path, n_samples_to_generate(spec))
+    assert seconds is not None
+    assert 0 < seconds < sum(waited)
 
 
 def test_compilation_is_no_part_of_the_cost_of_samples(

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter, process_time
 
-from numba.core.event import TimingListener, install_listener
+from mor_bench.compile_clock import compile_clock
 
 
 @dataclass
@@ -26,7 +26,7 @@ class FitCost:
     core_s : float
         Processor time of all threads of the process, and of its child processes that have ended, s.
     compile_s : float
-        Time of compilation, which is part of neither, s. It runs on one core.
+        Wall time of compilation, s. Neither contains it.
     """
 
     wall_s: float = 0.0
@@ -38,13 +38,13 @@ class FitCost:
 def fit_clock() -> Iterator[FitCost]:
     """Measure the block; the cost is complete at its end."""
     cost = FitCost()
-    with install_listener("numba:compile", TimingListener()) as compilation:  # type: ignore[no-untyped-call]
+    with compile_clock() as compilation:
         busy, start = _core_s(), perf_counter()
         yield cost
         wall, cores = perf_counter() - start, _core_s() - busy
-    cost.compile_s = compilation.duration if compilation.done else 0.0
-    cost.wall_s = max(wall - cost.compile_s, 0.0)
-    cost.core_s = max(cores - cost.compile_s, 0.0)
+    cost.compile_s = compilation.wall_s
+    cost.wall_s = max(wall - compilation.wall_s, 0.0)
+    cost.core_s = max(cores - compilation.core_s, 0.0)
 
 
 def _core_s() -> float:

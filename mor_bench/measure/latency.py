@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from os import cpu_count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from mor_bench.array_files import parse_npy
 from mor_bench.checked_files import read_written
 from mor_bench.errors import MorBenchError, StoreError
-from mor_bench.machine import free_memory_bytes, pinned_threads
+from mor_bench.machine import free_memory_bytes, pinned_threads, usable_cores
 from mor_bench.measure.course import Course
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.measure.method_session import MethodSession
@@ -222,7 +221,7 @@ def _open_all(
     wanted = {label: turn for label, turn in turns.items() if not turn.timing.failed}
     for turn in wanted.values():
         stack.callback(turn.end)
-    with stoppable_threads(cpu_count() or 1) as pool:
+    with stoppable_threads(usable_cores()) as pool:
         list(pool.in_order(lambda turn: turn.open(server, seed), wanted.values()))
     return {label: turn for label, turn in wanted.items() if not turn.timing.failed}
 
@@ -297,7 +296,7 @@ class _Turns:
 
     def on_all_cores(self, batches: bool) -> None:
         """Time single queries on all cores and, if wanted, batches."""
-        cores = cpu_count() or 1
+        cores = usable_cores()
         self.timing.all_threads_ms += self._timed(self.n_queries, cores)["latency_ms"]
         if batches:
             self.timing.throughput = self._ask(

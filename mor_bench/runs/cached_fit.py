@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
@@ -31,7 +30,7 @@ from pydantic import BaseModel, ConfigDict
 from mor_bench.checked_files import read_json
 from mor_bench.digests import digest_of_file
 from mor_bench.errors import StoreError
-from mor_bench.machine import describe_machine, gpu_name
+from mor_bench.machine import describe_machine, gpu_name, usable_cores
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.results.arrays import verified_arrays, write_verified
 from mor_bench.results.parts import TrainedElsewhere
@@ -89,7 +88,7 @@ class RunEnvironment:
     @property
     def fit_threads(self) -> int:
         """Threads of a fit."""
-        return max(1, (os.cpu_count() or 1) // self.jobs)
+        return max(1, usable_cores() // self.jobs)
 
 
 class FitRecord(BaseModel):

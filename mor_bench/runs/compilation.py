@@ -20,6 +20,7 @@ from threading import Lock
 from llvmlite import binding
 
 from mor_bench.errors import MorBenchError
+from mor_bench.machine import usable_cores
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.mechanics.kernels import internal_force
 from mor_bench.runs.code_digest import code_digest
@@ -97,7 +98,7 @@ def compile_kernels(
 
     with tempfile.TemporaryDirectory(dir=scratch) as folder:
         compile_group(waiting[0])
-        with stoppable_threads(os.cpu_count() or 1) as threads:
+        with stoppable_threads(usable_cores()) as threads:
             list(threads.in_order(compile_group, waiting[1:]))
         context.listener.compiling(waiting[-1].method.name, len(waiting), len(waiting))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from statistics import median
 from time import perf_counter
 
 from mor_bench.errors import StoreError
+from mor_bench.machine import usable_cores
 from mor_bench.measure.latency import (
     BATCH_S,
     MOST_BATCH_S,
@@ -76,7 +76,7 @@ class Pace:
         here, there = MachineSpeed.measure(networks), reference.speed
         training = 1.0
         if here.convolution_ms and there.convolution_ms:
-            cores = reference.cores / (os.cpu_count() or 1)
+            cores = reference.cores / usable_cores()
             training = here.convolution_ms / there.convolution_ms * cores
         return cls(
             here.interpreter_ms / there.interpreter_ms,
@@ -114,7 +114,7 @@ def compile_seconds(
     if not each:
         return 0.0
     first, *others = each
-    side_by_side = max(sum(others) / (os.cpu_count() or 1), max(others, default=0.0))
+    side_by_side = max(sum(others) / usable_cores(), max(others, default=0.0))
     return pace.interpreter * (KERNELS_S + first + side_by_side)
 
 
@@ -180,7 +180,7 @@ def timing_seconds(
     configurations: Sequence[Configuration], context: RunContext, query_s: float, pace: Pace
 ) -> float:
     """Estimate the seconds of timing configurations, each as fast as a typical query."""
-    protocol, cores = PROTOCOLS[context.options.profile], os.cpu_count() or 1
+    protocol, cores = PROTOCOLS[context.options.profile], usable_cores()
     turn = min(MOST_TURN_S, max(TURN_S, (protocol.queries + SETTLE_QUERIES) * query_s))
     batches = [max(BATCH_S, n * query_s) for n in BATCHES if n * query_s <= MOST_BATCH_S]
     turns = protocol.processes * (protocol.rounds + 1) * turn + sum(batches)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from mor_bench.checked_files import read_written
 from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
+from mor_bench.machine import usable_cores
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.runs.cached_fit import CachedFit, FitRecord
 from mor_bench.runs.configurations import Configuration
@@ -159,7 +159,7 @@ def fit_on_cluster(task: ClusterFit) -> tuple[dict[str, Any], bytes | None]:
             parameters=task.configuration.parameters,
             train=train,
             model=model,
-            threads=os.cpu_count() or 1,
+            threads=usable_cores(),
             limit_s=task.limit_s,
             training=task.configuration.training,
             validation=validation,

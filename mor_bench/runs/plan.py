@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from mor_bench.errors import StoreError
+from mor_bench.machine import usable_cores
 from mor_bench.options import RunOptions
 from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
 from mor_bench.runs.configurations import (
@@ -300,7 +300,7 @@ def _data_step(spec: AnyDatasetSpec, context: RunContext) -> Step:
     )
     if not missing:
         return Step(spec.name, f"{n:,} samples", True, 0.0, "samples")
-    workers = context.options.workers or os.cpu_count() or 1
+    workers = context.options.workers or usable_cores()
     seconds = missing * sample_seconds(spec) / workers
     return Step(spec.name, f"{missing:,} of {n:,} samples", False, seconds, "samples")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mor_bench.errors import InvalidInputError, MorBenchError
-from mor_bench.machine import pinned_threads
+from mor_bench.machine import pinned_threads, usable_cores
 from mor_bench.measure.error_metrics import sample_errors, summary
 from mor_bench.measure.predictions import predict_all
 from mor_bench.method_loading import check_predicts, make_surrogate
@@ -154,7 +153,7 @@ def fit(
         cache=chosen.cache,
         progress=partial(listener.generating, spec.name),
     )
-    with pinned_threads(chosen.threads or os.cpu_count() or 1):
+    with pinned_threads(chosen.threads or usable_cores()):
         with _one_line(method_spec):
             seconds = _fit_and_save(unfitted, data, out)
         if trains:

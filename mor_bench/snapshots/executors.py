@@ -24,7 +24,7 @@ from time import sleep
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError, WorkerError, check_count
-from mor_bench.machine import SIGNAL_CHECK_S
+from mor_bench.machine import SIGNAL_CHECK_S, usable_cores
 from mor_bench.parent_death import end_with_parent
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def open_pool(workers: int | None, cluster: str | None) -> Iterator[Pool]:
     elif workers == 1:
         yield Pool(_InThisProcess(), lambda: 1)
     else:
-        with worker_pool(workers or os.cpu_count() or 1) as pool:
+        with worker_pool(workers or usable_cores()) as pool:
             yield pool
 
 

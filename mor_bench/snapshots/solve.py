@@ -7,14 +7,14 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from time import perf_counter
+from time import thread_time
 
 import numpy as np
 import scipy.sparse as sp
-from numba.core.event import TimingListener, install_listener
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from mor_bench.compile_clock import compile_clock
 from mor_bench.errors import InvertedElementError, SolverError, WorkerError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
@@ -149,16 +149,14 @@ def solve_task(task: Task) -> Solved:
     displacements = np.full(values.shape, np.nan)
     min_det_f: NDArray[np.float64] = np.full(len(loads), np.nan)
     status = np.zeros(len(loads), dtype=np.uint8)
-    with _single_threaded(), install_listener("numba:compile", TimingListener()) as compilation:  # type: ignore[no-untyped-call]
-        begun = perf_counter()
+    with _single_threaded(), compile_clock() as compilation:
+        begun = thread_time()  # core-seconds, which other programs hardly change
         for row, found in enumerate(_solutions(model, values, task, loads.parameters)):
             if isinstance(found, Solution):
                 displacements[row], min_det_f[row] = found.displacement, found.min_det_f
             else:
                 inverted = isinstance(found, InvertedElementError)
                 status[row] = STATUSES.index("inverted" if inverted else "no-equilibrium")
-        seconds = perf_counter() - begun
-    if compilation.done:  # the compiled kernels stay, for all later samples
-        seconds = max(seconds - compilation.duration, 0.0)
+        seconds = max(thread_time() - begun - compilation.core_s, 0.0)
     columns = loads.patches, loads.vectors, displacements, min_det_f, status, loads.parameters
     return Solved(Shard(task.dataset, task.start, *columns), seconds)
