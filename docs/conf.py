@@ -64,6 +64,7 @@ sphinx_gallery_conf = {
     "examples_dirs": ["examples"],
     "gallery_dirs": ["gallery"],
     "filename_pattern": r"\.py$",
+    "run_stale_examples": True,  # their pictures depend on the stored runs, too
     "copyfile_regex": r".*\.toml",
     "download_all_examples": False,
     "show_memory": False,

@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from contextlib import chdir
 from pathlib import Path
 
+import meshio
+import numpy as np
 import pytest
 
 import mor_bench
 from mor_bench.analysis.selection import asked_of
 from mor_bench.analysis.selection_text import run_command
 from mor_bench.runs.file_check import check_file
+from mor_bench.scene.mesh import FACES, box_mesh
 from mor_bench.scene.snapshot_file import OPTIONAL, REQUIRED
 from tests.small_runs import PLAIN, short_timing
 
@@ -39,6 +42,21 @@ def test_the_datasets_of_the_guide_are_valid(folder: Path) -> None:
     assert check_file(folder / "body.toml") == body
     mine = f"dataset of imported snapshots, {counts}, 15 of them fixed, "
     assert check_file(folder / "mine.toml").startswith(mine)
+
+
+def test_the_surface_of_the_guide_becomes_voxels(tmp_path: Path) -> None:
+    (geometry,) = re.findall(r"```toml\n(\[geometry\]\nshape = \"voxels\".*?)```", GUIDE, re.DOTALL)
+    (body,) = re.findall(r"<!-- toml: body.toml -->\n```toml\n(.*?)```", GUIDE, re.DOTALL)
+    _, rest = body.split("[discretisation]")
+    rest = rest.replace('{ point_set = "held" }', '"x-min"').partition("[loads]")[0]
+    (tmp_path / "organ.toml").write_text(f"{geometry}\n[discretisation]{rest}", encoding="utf-8")
+    box = box_mesh((12.0, 4.0, 2.0), (1, 1, 1))
+    quads = box.cells[0][FACES[8]]
+    triangles = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
+    meshio.Mesh(box.points, [("triangle", triangles)]).write(tmp_path / "organ.stl")
+    scene = mor_bench.load_scene(tmp_path / "organ.toml")
+    assert len(scene.mesh.cells) == 16 * 12 * 12
+    np.testing.assert_allclose(np.ptp(scene.mesh.points, axis=0), [0.12, 0.04, 0.02], rtol=1e-6)
 
 
 @pytest.mark.slow

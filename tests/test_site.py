@@ -27,7 +27,8 @@ def test_every_method_has_a_card_and_every_card_a_method() -> None:
 def test_cards_have_an_equation_an_algorithm_a_cost_and_a_source() -> None:
     for path in CARDS.glob("*.md"):
         headings = re.findall(r"^## (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
-        assert headings == ["Equation", "Algorithm", "Cost", "Source"], path.name
+        usual = [heading for heading in headings if heading != "Variants"]
+        assert usual == ["Equation", "Algorithm", "Cost", "Source"], path.name
 
 
 def test_every_method_page_says_where_the_method_fails(tmp_path: Path) -> None:
@@ -130,3 +131,21 @@ def test_a_downloaded_notebook_has_no_markup_of_the_site() -> None:
     assert "needs an installed mor-bench" in prose
     assert not re.search(r"\{[\w-]+\}`|\]\([\w./-]+\.md", prose)
     assert cleaned["cells"][1] == code
+
+
+def test_a_card_joins_configurations_of_one_kind_that_none_of_it_beats() -> None:
+    import method_cards
+
+    for name in ("deeponet", "quadratic-manifold-pod", "deim", "pod"):
+        rows = [row for _, row in method_cards.measured(name) if row.dataset == "beam-coarse"]
+        curves = method_cards.curves_of(rows)
+        assert sum(map(len, curves.values())) == len(rows)
+        for mine in curves.values():
+            kinds = {tuple(v for v in row.swept.values() if isinstance(v, str)) for row in mine}
+            assert len(kinds) == 1
+            front = method_cards.front_of(mine)
+            errors = [row.error.rel_l2_median for row in front]
+            assert errors == sorted(errors, reverse=True)
+            best = min(row.error.rel_l2_median for row in mine)
+            assert errors[-1] == best or max(errors[-1], best) < method_cards.LEAST_ERROR
+    assert len(method_cards.curves_of([r for _, r in method_cards.measured("deeponet")])) == 2

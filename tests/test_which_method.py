@@ -119,3 +119,9 @@ def test_the_page_names_the_fastest_without_snapshots() -> None:
     named = re.search(r"- \*\*No\*\*: \[`([\w-]+)`\]", PAGE)
     assert named
     assert f"| `{named[1]}` |" in row
+
+
+def test_the_first_page_counts_the_questions() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    counted = {7: "Seven", 8: "Eight", 9: "Nine"}[PAGE.count("\n::::{dropdown}")]
+    assert f"{counted} questions lead to a method" in index

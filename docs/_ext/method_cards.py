@@ -18,10 +18,12 @@ from sphinx.application import Sphinx
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import to_hex, to_rgb
 
 from mor_bench.report.cards import Card, method_card
 from mor_bench.report.method_styles import style_of
-from mor_bench.report.number_format import number, percent
+from mor_bench.report.number_format import number, percent, short_swept
 from mor_bench.report.suite_overview import overview
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
@@ -66,16 +68,67 @@ def picture(method: str, folder: Path) -> str | None:
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
     others = [row for row in points if row.method != method]
     axes.plot(*_places(others), "o", color="#c8c8c8", ms=4, label="other methods")
-    mine = [row for row in points if row.method == method]
     style = style_of(method)
-    axes.plot(*_places(mine), marker=style.marker, color=style.colour, label=method)
+    curves = curves_of([row for row in points if row.method == method])
+    shades = np.linspace(0.0, 0.7, max(len(curves), 2))
+    for number_of, ((name, rows), shade) in enumerate(zip(curves.items(), shades, strict=False)):
+        marker = (style.marker, *MORE_MARKERS)[number_of % (1 + len(MORE_MARKERS))]
+        look = {"color": blended(style.colour, shade), "marker": marker}
+        label = f"{method}, {name}" if name else method
+        front = front_of(rows)
+        axes.plot(*_places(rows), ls="none", **look, label="_" if len(front) > 1 else label)
+        if len(front) > 1:
+            axes.plot(*_places(front), **look, label=label)
+        for row in (front[0], front[-1]) if len(front) > 1 else ():
+            where = next(zip(*_places([row]), strict=True))
+            beside = (4, 4 - 13 * (number_of % 2))
+            text = short_swept(varied_in(rows, row))
+            axes.annotate(text, where, beside, textcoords="offset points", fontsize=7)
+    axes.margins(x=0.1)
     axes.set(xscale="log", yscale="log", xlabel="latency of one query, median (ms)")
     axes.set(ylabel="relative L2 error, median (%)", title=f"{method} on {dataset}")
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, fontsize=8)
     axes.grid(color="#e8e8e8")
     figure.savefig(folder / f"{method}.png", dpi=110)
     plt.close(figure)
     return f"{method}.png"
+
+
+MORE_MARKERS = "ovD^sP"
+
+
+def varied_in(rows: list[Row], row: Row) -> dict[str, Any]:
+    """Return the swept values of a row that differ within its group."""
+    return {k: v for k, v in row.swept.items() if any(other.swept.get(k) != v for other in rows)}
+
+
+def is_size(value: object) -> bool:
+    """Return whether a swept value is a number or a list of them, which trade speed for error."""
+    return not isinstance(value, bool | str)
+
+
+def curves_of(rows: list[Row]) -> dict[str, list[Row]]:
+    """Group configurations by what is not a number; one curve each, by the name of the group."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        kind = {key: value for key, value in row.swept.items() if not is_size(value)}
+        found.setdefault(", ".join(f"{key}={value}" for key, value in kind.items()), []).append(row)
+    return found
+
+
+def front_of(rows: list[Row]) -> list[Row]:
+    """Return the rows that no other one of the group beats in latency and error, fastest first."""
+    ordered = sorted(rows, key=lambda row: next(zip(*_places([row]), strict=True)))
+    front: list[Row] = []
+    for row in ordered:
+        if not front or _places([row])[1] < _places(front[-1:])[1]:
+            front.append(row)
+    return front
+
+
+def blended(colour: str, share: float) -> str:
+    """Return a colour mixed with a share of white."""
+    return to_hex([(1 - share) * part + share for part in to_rgb(colour)])
 
 
 LEAST_ERROR = 1e-6
@@ -120,6 +173,8 @@ def card_page(name: str, folder: Path, *, draw: bool = True) -> str:
     lines += ["## Measured", "", "Errors are those of the test samples of each stored run.", ""]
     if draw and (shown := picture(name, folder)):
         caption = f"Error over latency of {name}, with the other methods of the run in grey. "
+        caption += "A line joins the configurations that none of their group beats in both; its "
+        caption += "ends name their sizes. "
         caption += f"Errors below {100 * LEAST_ERROR:g} % are drawn there."
         lines += [f"![{caption}]({shown})", ""]
     lines += [*table(name), ""]

@@ -70,12 +70,11 @@ def _taylor(axes: plt.Axes) -> None:
 
 
 class PlotOrders(SphinxDirective):
-    """Insert the picture, drawing it once per build folder."""
+    """Draw the picture and insert it."""
 
     def run(self) -> list[nodes.Node]:
         path = Path(self.env.srcdir) / "methods" / "orders-of-convergence.png"
-        if not path.exists():
-            draw(path)
+        draw(path)
         return [nodes.image(uri="methods/orders-of-convergence.png", alt="Orders of convergence")]
 
 

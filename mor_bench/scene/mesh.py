@@ -118,6 +118,12 @@ def box_mesh(
         Hexahedra per axis.
     tetrahedra : bool, default False
         Cut each hexahedron into six T4.
+
+    Examples
+    --------
+    >>> mesh = box_mesh((4.0, 1.0, 1.0), (4, 1, 1))
+    >>> mesh.n_nodes, len(mesh.cells)
+    (20, 4)
     """
     shape = cells[0] + 1, cells[1] + 1, cells[2] + 1
     axes = [np.linspace(0.0, length, n) for length, n in zip(size_m, shape, strict=True)]

@@ -142,6 +142,14 @@ class PCAEstimator(CoordinateRegression):
         the displacement with the force as input.
     seed : int
         Its `random_state`, if it has one.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> data = mor_bench.load_dataset("beam-tiny")
+    >>> nearest = PCAEstimator("sklearn.neighbors:KNeighborsRegressor", {"n_neighbors": 4})
+    >>> nearest.fit(data.scene, data.train).predict(data.test.forces[0]).shape
+    (63, 3)
     """
 
     estimator: Annotated[str, AfterValidator(_checked_estimator)]
