@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mor_bench.report.number_format import number
+from mor_bench.report.number_format import DASH, number
 from tests.published.record import experiments
 from tests.published.run_tables import markdown
 from tests.published.stored import EvidenceError, content_of, number_of
@@ -13,7 +13,8 @@ def literature(source: str) -> str:
 
     An entry has the `family`, `what` is measured, the `published` number with its `unit` and
     `source`, the `nearest` set-up of ours, and a number `ours` as in claims.toml. Its file belongs
-    to the `experiment` of sources.toml.
+    to the `experiment` of sources.toml. `published_largest_m` and `largest` give the largest
+    displacements of both set-ups, m; with `relative`, our number is divided by it.
 
     Raises
     ------
@@ -25,7 +26,11 @@ def literature(source: str) -> str:
         name, file = entry["experiment"], entry["ours"]["file"]
         if name not in experiments() or not file.startswith(f"reports/{name}"):
             raise EvidenceError(f"{source}: {file} is not of an experiment {name!r}.")
-        ours = number_of(entry["ours"])
+        ours, amplitudes = number_of(entry["ours"]), DASH
+        if "largest" in entry:
+            largest = number_of(entry["largest"])
+            amplitudes = f"{number(entry['published_largest_m'])} / {number(largest)}"
+            ours /= largest if entry.get("relative") else 1.0
         body.append(
             [
                 entry["family"],
@@ -33,8 +38,9 @@ def literature(source: str) -> str:
                 f"{number(entry['published'])}: {entry['source']}",
                 f"{number(ours)}: {entry['nearest']}",
                 number(ours / entry["published"]),
+                amplitudes,
                 f"`{name}`",
             ]
         )
-    headings = ["family", "quantity", "published", "ours", "ours / published", "experiment"]
-    return markdown(headings, body)
+    headings = ["family", "quantity", "published", "ours", "ours / published"]
+    return markdown([*headings, "largest u, m: published / ours", "experiment"], body)
