@@ -12,16 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.analysis.frontier import (
-    EXACT,
-    TARGET_ERRORS,
-    TARGET_TIMES_MS,
-    Point,
-    compare,
-    error_at_time,
-    frontier_draws,
-    time_at_error,
-)
+from mor_bench.analysis.frontier import TARGET_ERRORS, compare
 from mor_bench.results.comparison import Comparison
 from tests.report_runs import add_row, tiny
 from tests.synthetic import (
@@ -73,34 +64,7 @@ def at_error(analysis: Record, method: str, target: float) -> Record:
     return next(r for r in records if (r["method"], r["target_rel_l2_median"]) == wanted)
 
 
-@pytest.mark.parametrize("held_out", [False, True])
-@pytest.mark.parametrize("n_configurations", [1, 2, 5, 12])
-def test_frontier_draws_are_the_frontier_points_of_each_resample(
-    n_configurations: int, held_out: bool
-) -> None:
-    generator = np.random.default_rng(n_configurations)
-    shape = (n_configurations, 60)
-    latencies = generator.normal(0, 1.5, shape).round(1)  # rounded, so that there are ties
-    errors = generator.normal(-3, 3, shape).round(1)  # some are worse than answering zero
-    errors[generator.random(shape) < 0.1] = np.inf
-    errors[generator.random(shape) < 0.05] = np.log(EXACT)
-    selecting = errors + generator.normal(0, 1, shape).round(1) if held_out else errors
-    found_times, found_errors = frontier_draws(
-        latencies, errors, TARGET_ERRORS, TARGET_TIMES_MS, selecting if held_out else None
-    )
-    for i in range(60):
-        figures = (np.exp(values[:, i]).tolist() for values in (latencies, errors, selecting))
-        points = [
-            Point(time, error, "", selects) for time, error, selects in zip(*figures, strict=True)
-        ]
-        times = [time_at_error(points, target)["latency_ms"] for target in TARGET_ERRORS]
-        reached = [error_at_time(points, target)["error"] for target in TARGET_TIMES_MS]
-        for found, expected in ((found_times, times), (found_errors, reached)):
-            plain = [np.inf if x is None else x for x in expected]
-            assert np.exp(found[:, i]) == pytest.approx(plain)
-
-
-def test_pairs_follow_the_frontier_that_validation_selects(tmp_path: Path) -> None:
+def test_pairs_compare_what_validation_selects(tmp_path: Path) -> None:
     made = tiny(tmp_path)
     for number, error, validation, latency in ((1, 0.008, 0.03, 1.0), (2, 0.009, 0.007, 2.0)):
         held_out = {"validation": {"rel_l2_median": validation}}
@@ -108,10 +72,11 @@ def test_pairs_follow_the_frontier_that_validation_selects(tmp_path: Path) -> No
     add_row(made, "lucky", {"k": 1}, 0.005, 0.5, validation={"rel_l2_median": 0.009})
     add_row(made, "lucky", {"k": 2}, 0.05, 0.4, validation={"rel_l2_median": 0.008})
     analysis = analyse(made, n_resamples=50)
-    assert at_error(analysis, "swept", 0.01)["latency_ms"] == 1.0
-    missed = at_error(analysis, "lucky", 0.01)
-    assert (missed["latency_ms"], missed["best"]["label"]) == (None, "lucky [k=2]")
-    assert pair(analysis, "swept", "lucky", 0.01)["by"] == ["lucky"]
+    assert at_error(analysis, "swept", 0.01)["best"]["label"] == "swept [k=2]"
+    assert at_error(analysis, "swept", 0.01)["latency_ms"] == 2.0
+    selected = at_error(analysis, "lucky", 0.01)  # also where its test error misses the target
+    assert (selected["latency_ms"], selected["best"]["label"]) == (0.4, "lucky [k=2]")
+    assert pair(analysis, "swept", "lucky", 0.01)["ratio"] == pytest.approx(5.0)
     assert pair(analysis, "swept", "lucky", 0.1)["ratio"] == pytest.approx(2.5)
     assert (
         at_error(analysis, "lucky", 0.1)["low"] <= 0.4 <= at_error(analysis, "lucky", 0.1)["high"]
@@ -166,16 +131,13 @@ def test_target_intervals_contain_their_value_or_report_a_target_out_of_reach(
     analysis: Record,
 ) -> None:
     for record in analysis["time_at_error"]:
-        if record["best"] is not None:
+        reached = record["best"] is not None
+        assert (record["low"] is not None) == (record["latency_ms"] is not None) == reached
+        if reached:
             assert record["best"]["bound"] <= record["target_rel_l2_median"]
-        assert (record["high"] is None) == (record["not_reached"] > 0.025)
-        if record["latency_ms"] is not None:
-            assert record["low"] <= record["latency_ms"] <= (record["high"] or np.inf)
-    far, near = (at_error(analysis, "linear-fem", target) for target in (0.01, 0.1))
-    assert (far["not_reached"], far["low"], far["high"]) == (1.0, None, None)
-    assert 0.025 < near["not_reached"] < 0.975  # its error is about 10.5 %
-    assert near["latency_ms"] is None
-    assert near["low"] is not None
+            assert record["low"] <= record["latency_ms"] <= record["high"]
+    for target in (0.01, 0.1):  # its error is about 10.5 %
+        assert at_error(analysis, "linear-fem", target)["best"] is None
 
 
 def test_pairs_are_antisymmetric_and_name_the_faster_method(analysis: Record) -> None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from threadpoolctl import threadpool_info
 
@@ -86,18 +86,16 @@ POINTS = [
 ]
 
 
-def test_a_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
+def test_the_selected_configuration_is_one_that_was_measured() -> None:
     assert [point.label for point in non_dominated(POINTS)] == ["a", "b", "c"]
-    middle = time_at_error(POINTS, math.sqrt(0.1 * 0.01))
-    assert middle["latency_ms"] == pytest.approx(math.sqrt(10.0))
+    middle = time_at_error(POINTS, 0.03)
     best = {"label": "b", "latency_ms": 10.0, "error": 0.01, "bound": None}
-    assert middle["best"] == best
+    assert middle == {"latency_ms": 10.0, "best": best}
     assert time_at_error(POINTS, 0.5)["latency_ms"] == 1.0
     assert time_at_error(POINTS, 0.0005) == {"latency_ms": None, "best": None}
     assert error_at_time(POINTS, 0.7) == {"error": None, "best": None}
-    between = error_at_time(POINTS, math.sqrt(10.0))
-    assert between["error"] == pytest.approx(math.sqrt(0.1 * 0.01))
-    assert between["best"]["label"] == "a"
+    between = error_at_time(POINTS, 3.0)
+    assert (between["error"], between["best"]["label"]) == (0.1, "a")
     assert error_at_time(POINTS, 1e6)["error"] == 0.001
 
 
@@ -108,7 +106,7 @@ def test_answers_worse_than_zero_are_on_no_front() -> None:
     assert error_at_time(useless, 1.0) == {"error": None, "best": None}
 
 
-def test_validation_selects_the_frontier_and_its_errors_are_those_of_the_test() -> None:
+def test_validation_selects_and_the_errors_are_those_of_the_test() -> None:
     points = [
         Point(1.0, 0.04, "fast", 0.02),
         Point(2.0, 0.012, "selected", 0.008),
@@ -116,53 +114,26 @@ def test_validation_selects_the_frontier_and_its_errors_are_those_of_the_test() 
         Point(8.0, 0.003, "slow", 0.002),
     ]
     assert [p.label for p in non_dominated(points)] == ["fast", "selected", "slow"]
-    found = time_at_error(points, 0.006)
-    assert found["latency_ms"] == pytest.approx(4.0)
-    found = time_at_error(points, 0.01)
-    assert found["best"] == {
-        "label": "selected",
-        "latency_ms": 2.0,
-        "error": 0.012,
-        "bound": 0.008,
-    }
-    within = error_at_time(points, 4.0)
-    assert within["error"] == pytest.approx(0.006)
-    assert within["best"]["error"] == 0.012
-    assert time_at_error([points[1]], 0.01)["latency_ms"] is None
+    assert time_at_error(points, 0.006)["latency_ms"] == 8.0
+    best = {"label": "selected", "latency_ms": 2.0, "error": 0.012, "bound": 0.008}
+    assert time_at_error(points, 0.01) == {"latency_ms": 2.0, "best": best}
+    assert error_at_time(points, 4.0) == {"error": 0.012, "best": best}
+    assert time_at_error([points[0]], 0.01) == {"latency_ms": None, "best": None}
 
 
-def test_a_frontier_that_errs_on_the_test_set_is_followed_from_the_first_configuration() -> None:
-    points = [Point(1.0, 0.02, "a", 0.03), Point(4.0, 0.08, "b", 0.01), Point(16.0, 2.0, "c", 1e-3)]
-    assert [p.label for p in non_dominated(points)] == ["a", "b"]
-    assert time_at_error(points, 0.05)["latency_ms"] == 1.0
-    assert error_at_time(points, 2.0)["error"] == pytest.approx(0.04)
-
-
-@example([(1.0, 1.0000000000000002e-06), (2.0, 1e-06)], 1e-06, 1.0)
 @given(
     st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 0.99)), min_size=1, max_size=12),
     st.floats(1e-6, 1.0),
     st.floats(1e-3, 1e3),
 )
-def test_a_frontier_stays_between_its_points(
+def test_no_other_configuration_is_better_for_a_target(
     points: list[tuple[float, float]], error: float, latency: float
 ) -> None:
     cloud = [Point(t, e, str(i)) for i, (t, e) in enumerate(points)]
-    front = non_dominated(cloud)
-    for point in cloud:
-        assert any(q.latency_ms <= point.latency_ms and q.error <= point.error for q in front)
-    above, below = 1 + 1e-9, 1 - 1e-9
-    at_error = time_at_error(cloud, error)
-    if at_error["best"] is None:
-        assert min(point.error for point in cloud) > error
-    else:
-        assert front[0].latency_ms * below <= at_error["latency_ms"]
-        assert at_error["latency_ms"] <= at_error["best"]["latency_ms"] * above
-    at_time = error_at_time(cloud, latency)
-    if at_time["best"] is None:
-        assert min(point.latency_ms for point in cloud) > latency
-    else:
-        assert front[-1].error * below <= at_time["error"] <= at_time["best"]["error"] * above
+    times = [t for t, e in points if e <= error]
+    errors = [e for t, e in points if t <= latency]
+    assert time_at_error(cloud, error)["latency_ms"] == min(times, default=None)
+    assert error_at_time(cloud, latency)["error"] == min(errors, default=None)
 
 
 def test_threads_are_pinned_and_then_restored() -> None:

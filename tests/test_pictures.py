@@ -373,4 +373,4 @@ def test_pictures_of_errors_say_what_each_method_is_told(tmp_path: Path) -> None
         explain_names(picture, made, "beam-coarse")
         note = " ".join(" ".join(text.get_text().split()) for text in picture.figure.texts)
         assert "Told: force only (umesh); force and linear response (pca-regression-linear)" in note
-        assert ("; equations (fem, " in note) == (draw is error_against_time)
+        assert ("; equations, reference (fem)" in note) == (draw is error_against_time)

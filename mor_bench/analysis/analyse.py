@@ -45,8 +45,7 @@ def analyse(
         `rows`: value, low and high of the main figures of each configuration, and `error_bound`,
         the error that selects it.
         `time_at_error`, `error_at_time`: records of `mor_bench.analysis.frontier.compare` with
-        two additions. `low`, `high`: None where not reached. `not_reached`: share of resamples that
-        do not reach the target.
+        `low` and `high`, which are None where not reached.
         `pairwise`: for each ordered pair of methods and error, the ratio of their times and the
         verdict on the first.
         `break_even`, `profile`, `hidden`, `regimes`, `tuning`: see the functions of these names.

@@ -10,7 +10,7 @@ from typing import Any
 
 from mor_bench.analysis.frontier import median_error, median_latency_ms
 from mor_bench.analysis.told import class_text, told_text
-from mor_bench.analysis.verdict import RULE, Requirements, Verdict
+from mor_bench.analysis.verdict import CHANCE_S, RULE, Requirements, Verdict
 from mor_bench.options import (
     DEFAULT_SEEDS,
     DEFAULT_TIME_LIMIT_S,
@@ -168,7 +168,7 @@ def _alternatives(verdict: Verdict, choice: Row) -> list[str]:
     if cheapest is not None:
         name = "the winner itself" if cheapest == choice else _short(cheapest)
         cost = cheapest.offline_core_s
-        chance = " Repeated fits differ: the order of such costs is partly chance."
+        chance = " Such costs count as equal, since repeated fits differ: the fastest is named."
         brief = cost is not None and cost < CHANCE_S
         lines.append(f"Cheapest offline: {name}, {_core_seconds(cost)}.{chance * brief}")
     for told, best in verdict.best_told.items():
@@ -301,10 +301,6 @@ def evidence(verdict: Verdict, row: Row) -> list[str]:
         missing = f", {found.n_failed} without an answer" if found.n_failed else ""
         lines.append(f"    {name:<8} {_errors(found)} on {found.n} loads{missing}")
     return lines
-
-
-CHANCE_S = 1.0
-"""Offline cost below which repeated fits differ by factors, core-seconds; not shown in digits."""
 
 
 def _core_seconds(value: float | None) -> str:

@@ -225,14 +225,17 @@ class Verdict:
         }
 
 
+CHANCE_S = 1.0
+"""Offline cost below which repeated fits differ by factors, core-seconds; not shown in digits."""
+
+
 def offline_rank(row: Row) -> tuple[Any, ...]:
     """Rank by offline cost in core-seconds, to two digits, then by speed.
 
-    Repeated fits of less than a second differ by more than the rounding: the order of such costs is
-    partly chance. Rows with an unknown cost come last.
+    Costs below `CHANCE_S` count as equal. Rows with an unknown cost come last.
     """
     seconds = number_or_inf(row.offline_core_s)
-    return float(f"{seconds:.1e}"), *speed_rank(row)
+    return 0.0 if seconds < CHANCE_S else float(f"{seconds:.1e}"), *speed_rank(row)
 
 
 def speed_rank(row: Row) -> tuple[float, float, str]:

@@ -251,8 +251,8 @@ def _wide_parts(
         yield Text(renamed(line, names), no_wrap=True)
     for kind in ("time_at_error", "error_at_time"):
         yield from _target_parts(target_table(comparison, dataset, kind, analysis))
-    basis = [interval_basis(dataset, analysis), "Nothing is extrapolated."]
-    yield Text("  ".join(filter(None, basis)), style="dim")
+    if basis := interval_basis(dataset, analysis):
+        yield Text(basis, style="dim")
     yield from _pairwise_parts(comparison, dataset, analysis)
     yield from _out_of_range_parts(entries)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 from matplotlib.text import Text
 
-from mor_bench.analysis.told import classes_of, given_by, told_text
+from mor_bench.analysis.told import class_text, classes_of, given_by
 from mor_bench.report.canvas import Drawn, Picture, add_note, save
 from mor_bench.report.distribution_figure import error_distribution
 from mor_bench.report.entries import Analysis, dataset_names
@@ -23,8 +23,8 @@ from mor_bench.report.worst_samples import worst_samples
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 
-ERRORS_OF_METHODS = ("error-against-time", "error-against-deformation")
-"""Pictures that compare all methods, so that they must say what each is told."""
+WITHOUT_TOLD = ("singular-values", "error-over-position")
+"""Pictures of no method, and those that say themselves what a method is told."""
 
 ALL = "all datasets"
 """Replaces the dataset's name in figures about all datasets."""
@@ -55,18 +55,19 @@ def explain_names(picture: Picture, comparison: Comparison, dataset: str) -> Non
     shown = " ".join(drawn)
     if note := explained_values(rows, shown):
         add_note(picture.figure, note)
-    if picture.kind in ERRORS_OF_METHODS and (note := _told(rows, shown, comparison, dataset)):
+    if picture.kind not in WITHOUT_TOLD and (note := _told(rows, shown, comparison, dataset)):
         add_note(picture.figure, note)
 
 
 def _told(rows: Sequence[Row], shown: str, comparison: Comparison, dataset: str) -> str:
-    """Name the methods of a picture by what they are told at query time."""
-    given, parts = given_by(comparison, dataset), []
-    for told in classes_of(rows):
-        methods = dict.fromkeys(row.method for row in rows if row.told == told)
-        named = [m for m in methods if re.search(rf"(?<![\w-]){re.escape(m)}(?![\w-])", shown)]
-        if told and named:
-            parts.append(f"{told_text(told, given)} ({', '.join(named)})")
+    """Name the methods of a picture by what they are given, and references as such."""
+    given, order = given_by(comparison, dataset), classes_of(rows)
+    named: dict[str, list[str]] = {}
+    for row in sorted(rows, key=lambda row: (order.index(row.told), row.reference)):
+        if row.told and re.search(rf"(?<![\w-]){re.escape(row.method)}(?![\w-])", shown):
+            methods = named.setdefault(class_text(row, given), [])
+            methods += [row.method] if row.method not in methods else []
+    parts = [f"{words} ({', '.join(methods)})" for words, methods in named.items()]
     return f"Told: {'; '.join(parts)}" if parts else ""
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf
 from typing import Any
 
-from mor_bench.analysis.selection_text import CHANCE_S, NO_RUNNER_UP, RUNNER_UP
+from mor_bench.analysis.selection_text import NO_RUNNER_UP, RUNNER_UP
+from mor_bench.analysis.verdict import offline_rank
 from mor_bench.report.entries import Entry, most_accurate
 from mor_bench.report.number_format import DASH, number, percent, span, whole
 from mor_bench.report.short_names import renamed
@@ -238,25 +238,16 @@ def _pays_off(known: FullOrder | None, first: Entry) -> str:
 def _by_offline(
     qualified: Sequence[Entry], cheapest: str | None, names: Mapping[str, str]
 ) -> Ranking:
-    def cost(entry: Entry) -> float:
-        seconds = entry.row.offline_core_s
-        return inf if seconds is None else seconds
-
-    ordered = sorted(qualified, key=cost)
+    ordered = sorted(qualified, key=lambda entry: offline_rank(entry.row))
     first = next((e for e in qualified if e.label == cheapest), ordered[0])
     second = next((e for e in ordered if e.method != first.method), None)
     picks = [_pick("cheapest offline", first, names)]
     picks += [_pick(RUNNER_UP, second, names)] if second else []
     sentence = (
-        "Offline cost: core-seconds of training data and fit. Repeated fits differ, so costs "
-        "are compared with two digits; the order of fits of less than a second is partly chance."
+        "Offline cost: core-seconds of training data and fit, compared with two digits. Repeated "
+        "fits differ, so costs of less than a second count as equal; the fastest of them is named."
     )
-    alike = [e for e in qualified if e.method == first.method and cost(e) < CHANCE_S]
-    title = f"Take {names[first.label]}"
-    if len(alike) > 1:
-        title = f"Take {first.method}, any of {len(alike)}"
-        sentence += f" So {listed([names[e.label] for e in alike])} cannot be told apart."
-    return Ranking("offline cost", title, picks, sentence)
+    return Ranking("offline cost", f"Take {names[first.label]}", picks, sentence)
 
 
 def _pick(part: str, entry: Entry, names: Mapping[str, str]) -> Pick:

@@ -29,11 +29,9 @@ PAIRWISE_LEGEND = (
 )
 
 TARGETS_NOTE = (
-    "Test errors, interpolated along the frontier of a method. The error of the verdict (the 95 % "
-    "upper bound on the validation part) selects its configurations: no other one is both faster "
-    "and more accurate. In brackets: the configuration that the verdict would choose for the "
-    "target, with its figure on the test set. Small: the 95 % interval of the interpolated value; "
-    "it is not that of the configuration."
+    "Of each method, the configuration that the verdict would choose for the target: its error is "
+    "the 95 % upper bound on the validation part. Its figures are those of the test set, with the "
+    "95 % interval."
 )
 
 FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
@@ -43,8 +41,8 @@ FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
 def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Analysis) -> TextTable:
     """Build the table of time at error or error at time, a row per method.
 
-    A cell has the interpolated value on the test set, the configuration that validation selects
-    for the target, and the 95 % interval. `kind` is "time_at_error" or "error_at_time".
+    A cell has the figure of the configuration that validation selects for the target, its name,
+    and the 95 % interval. `kind` is "time_at_error" or "error_at_time".
     """
     told = told_by_method(entries_of(comparison, dataset))
     names = short_names(row for row in comparison.rows if row.dataset == dataset)
@@ -56,10 +54,9 @@ def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Anal
         if record["dataset"] != dataset:
             continue
         best, cell = record["best"], NOT_REACHED
-        if best is not None or record[key] is not None:
-            value = NOT_REACHED if record[key] is None else f"{shown(record[key])} {unit}"
-            lines = [f"{value} ({shown(best and best[key])})", best and names[best["label"]].values]
-            if of_time and best and best["error"] > record["target_rel_l2_median"]:
+        if best is not None:
+            lines = [f"{shown(record[key])} {unit}", names[best["label"]].values]
+            if of_time and best["error"] > record["target_rel_l2_median"]:
                 lines.append(f"test error {percent(best['error'])} %")
             cell = "\n".join(filter(None, [*lines, _target_interval(record, shown)]))
         headings[_target_heading(record)] = None
@@ -81,14 +78,9 @@ def _target_heading(record: Mapping[str, Any]) -> str:
 
 
 def _target_interval(record: Mapping[str, Any], shown: Callable[[float | None], str]) -> str:
-    """Format the interval of a target; mention it if many resamples do not reach the target."""
+    """Format the interval of a target."""
     low, high = record["low"], record["high"]
-    if low == high == 0:
-        return ""
-    if low is None:
-        missed = record["not_reached"]
-        return f"{NOT_REACHED} in {percent(missed)} %" if missed else ""
-    return f"{shown(low)}–{NOT_REACHED if high is None else shown(high)}"
+    return "" if low is None or low == high == 0 else f"{shown(low)}–{shown(high)}"
 
 
 @dataclass(frozen=True)
@@ -160,8 +152,8 @@ def pairwise(comparison: Comparison, dataset: str, analysis: Analysis) -> list[T
             for method, *lines in zip(pairs.methods, pairs.cells, pairs.intervals, strict=True)
         ]
         of_need = ", the required error" if target == needed else ""
-        note = f"{PAIRWISE_LEGEND} Below: the 95 % interval of that factor. Times are "
-        note += "interpolated at this error, so they differ from those of single configurations."
+        note = f"{PAIRWISE_LEGEND} Below: the 95 % interval of that factor. Compared are the "
+        note += "configurations that the verdict would choose for this error."
         note += f" Not reached by {', '.join(pairs.absent)}." if pairs.absent else ""
         title = f"Who is faster at {percent(target)} %{of_need}"
         tables.append(TextTable(title, note, ["", *pairs.methods], rows))

@@ -9,20 +9,18 @@ The first word names the evidence, the second a function of `TABLES`, the others
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
+from tests.published.number_tables import NUMBER_TABLES
 from tests.published.other_tables import OTHER_TABLES
 from tests.published.run_tables import RUN_TABLES
-from tests.published.stored import ROOT, EvidenceError
+from tests.published.stored import BLOCK, ROOT, EvidenceError
 
-TABLES: dict[str, Callable[..., str]] = {**RUN_TABLES, **OTHER_TABLES}
+TABLES: dict[str, Callable[..., str]] = {**RUN_TABLES, **OTHER_TABLES, **NUMBER_TABLES}
 
 PAGES = ("README.md", "docs/*.md", "reports/README.md")
 """Pages whose numbers must have evidence."""
-
-BLOCK = re.compile(r"<!-- from: (?P<spec>[^\n]*?) -->\n(?P<body>.*?)<!-- end -->", re.DOTALL)
 
 
 def pages(root: Path = ROOT) -> list[Path]:

@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.published.blocks import BLOCK
-from tests.published.stored import ROOT, EvidenceError, content_of, number_of
+from tests.published.stored import BLOCK, ROOT, EvidenceError, content_of, number_of
 
 CLAIMS = "reports/claims.toml"
 

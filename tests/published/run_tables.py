@@ -8,8 +8,8 @@ from typing import Any
 
 from mor_bench.analysis.break_even import FULL_ORDER, break_even
 from mor_bench.analysis.frontier import median_error, median_latency_ms, number_or_inf
-from mor_bench.analysis.selection_text import CHANCE_S
 from mor_bench.analysis.told import class_text, given_by
+from mor_bench.analysis.verdict import CHANCE_S
 from mor_bench.report.entries import entries_of
 from mor_bench.report.number_format import DASH, number, percent, short_swept
 from mor_bench.report.paper_tables import against_the_paper
@@ -219,6 +219,26 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     return markdown([*headings, "smallest median %; its max %"], body)
 
 
+def named_sets(source: str, dataset: str = "", methods: str = "") -> str:
+    """Show errors on the named test sets: of each method the configuration for the least error."""
+    run = run_of(source)
+    name = dataset or next(iter(run.datasets))
+    bounds = error_bounds(run, name)
+    rows = [chosen(mine, bounds) for mine in _by_method(_rows(run, dataset, methods)).values()]
+    names = list(dict.fromkeys(each for row in rows for each in row.sets))
+    body = []
+    for row in rows:
+        found = [row.error, *(row.sets.get(each) for each in names)]
+        cells = [
+            DASH if each is None else f"{_percent(each.rel_l2_median)}; {_percent(each.rel_l2_max)}"
+            for each in found
+        ]
+        told = class_text(row, given_by(run, name))
+        body.append([f"`{row.method}`", told, _configuration(row), *cells])
+    sets = ["split's test part", *(f"`{each}`" for each in names)]
+    return markdown(["method", "is given", "configuration", *sets], body)
+
+
 def verdict(source: str, dataset: str = "") -> str:
     """State the verdict on a dataset in the words of the report."""
     run = run_of(source)
@@ -318,6 +338,7 @@ RUN_TABLES: dict[str, Callable[..., str]] = {
     "selected": selected,
     "best-of-class": best_of_class,
     "fastest": fastest,
+    "named-sets": named_sets,
     "verdict": verdict,
     "headline": headline,
     "indicated": indicated,

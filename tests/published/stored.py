@@ -20,6 +20,9 @@ ROOT = Path(__file__).parents[2]
 
 REPORTS = ROOT / "reports"
 
+BLOCK = re.compile(r"<!-- from: (?P<spec>[^\n]*?) -->\n(?P<body>.*?)<!-- end -->", re.DOTALL)
+"""A generated table in a page."""
+
 REDUCE: dict[str, Callable[[Any], float]] = {
     "median": np.median,
     "mean": np.mean,
