@@ -178,9 +178,10 @@ def test_equal_methods_rarely_differ_and_a_difference_of_ten_percent_is_found(
     assert np.mean(right) >= 0.95
 
 
-def test_noise_that_methods_share_cancels_in_their_ratio(tmp_path: Path) -> None:
-    made, regions = empty(tmp_path)
-    generator = np.random.default_rng(1)
+def two_methods(out: Path, seed: int) -> Comparison:
+    """Return a comparison in which b takes 1.2 times as long as a, at the same errors."""
+    made, regions = empty(out)
+    generator = np.random.default_rng(seed)
     speed = 0.1 * generator.normal(size=(N_PROCESSES, 1)) + STEADY
     effects = 0.5 * generator.normal(size=13)
     for rank, error, latency in ((5, 0.06, 0.5), (40, 0.01, 4.0)):
@@ -188,12 +189,20 @@ def test_noise_that_methods_share_cancels_in_their_ratio(tmp_path: Path) -> None
         for method, factor in (("a", 1.0), ("b", 1.2)):
             timed = timings(generator, speed, factor * latency, spread=0.005)
             add_configuration(made, a_row(method, {"n_modes": rank}), errors, timed)
-    found = analyse(made, n_resamples=500)
-    alone, ratio = at_error(found, "a", 0.03), pair(found, "b", "a", 0.03)
-    assert alone["high"] / alone["low"] > 1.4
-    assert ratio["high"] / ratio["low"] < 1.1
-    assert ratio["verdict"] == "slower"
-    assert ratio["low"] < 1.2 < ratio["high"]
+    return made
+
+
+def test_noise_that_methods_share_cancels_in_their_ratio(tmp_path: Path) -> None:
+    covered, alone = [], []
+    for seed in range(40):
+        found = analyse(two_methods(tmp_path / str(seed), seed), n_resamples=500)
+        ratio, time = pair(found, "b", "a", 0.03), at_error(found, "a", 0.03)
+        alone.append(time["high"] / time["low"])
+        assert ratio["high"] / ratio["low"] < min(1.1, alone[-1])
+        assert ratio["verdict"] == "slower"
+        covered.append(ratio["low"] < 1.2 < ratio["high"])
+    assert np.median(alone) > 1.2
+    assert sum(covered) >= 35  # of 40 intervals that cover 95 %
     targets = {record["target_rel_l2_median"] for record in found["pairwise"]}
     assert targets == {0.02, *TARGET_ERRORS}  # the error that the dataset needs is a target too
 

@@ -119,8 +119,11 @@ def test_the_fastest_wins_and_the_cheapest_offline_stands_beside_it() -> None:
     ]
     assert choose(rows[:2], ASKED).cheapest == rows[0]  # a tie in two digits goes to the faster
     assert choose(rows, ASKED).cheapest == rows[2]
-    brief = [row.with_parts(offline_s={"data": 0.0, "fit": 0.01 * i}) for i, row in enumerate(rows)]
-    assert choose(list(reversed(brief)), ASKED).cheapest == brief[0]
+    brief = [
+        a_row(name, latency_ms={"median": ms}, offline_s={"data": 0.0, "fit": fit_s})
+        for name, ms, fit_s in (("a", 1.0, 0.9), ("b", 2.0, 0.1), ("c", 3.0, 0.01))
+    ]
+    assert choose(brief, ASKED).cheapest == brief[0]  # costs below a second are equal
 
 
 def test_validation_selects_and_the_test_set_confirms() -> None:
