@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from mor_bench.analysis.told import class_text, given_by
 from mor_bench.report.entries import verdict_of
 from mor_bench.report.suite_overview import overview
 from mor_bench.results.comparison import Comparison
@@ -17,7 +18,7 @@ from tests.published.stored import REPORTS, ROOT, run_of
 
 PAGE = (ROOT / "docs" / "which-method.md").read_text(encoding="utf-8")
 ROW = re.compile(
-    r"^\| `([\w-]+)` \| \[?`([\w/-]+)`.* \| (`.*`~?|none qualifies) \| (\d+ of \d+) \|$",
+    r"^\| `([\w-]+)` \| \[?`([\w/-]+)`.* \| (`.*`~?|none qualifies) \| ([^|]+) \| (\d+ of \d+) \|$",
     re.MULTILINE,
 )
 
@@ -41,13 +42,13 @@ def methods_of(verdict: dict[str, Any]) -> list[str]:
 
 def test_the_page_names_the_winner_of_every_stored_run() -> None:
     named = {
-        (scene, run): re.findall(r"`([\w-]+)`", cell) for scene, run, cell, _ in ROW.findall(PAGE)
+        (scene, run): re.findall(r"`([\w-]+)`", cell) for scene, run, cell, *_ in ROW.findall(PAGE)
     }
     assert named == stored_verdicts()
 
 
 def test_the_page_tells_which_verdicts_rest_on_unstable_timings() -> None:
-    for scene, run, cell, count in ROW.findall(PAGE):
+    for scene, run, cell, given, count in ROW.findall(PAGE):
         stored = run_of(f"reports/{run}")
         rows = {row.label: row for row in stored.rows if row.dataset == scene and row.ok}
         stable = {label: row.latency_ms.stable for label, row in rows.items() if row.latency_ms}
@@ -55,6 +56,8 @@ def test_the_page_tells_which_verdicts_rest_on_unstable_timings() -> None:
         choice = verdict_of(stored.analysis or {}, scene)["choice"]
         unstable = choice is not None and not stable[choice]
         assert ("`~" in cell) == unstable, run
+        told = "–" if choice is None else class_text(rows[choice], given_by(stored, scene))
+        assert given == told, run
 
 
 def test_the_page_is_right_about_observed_displacements() -> None:
