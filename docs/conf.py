@@ -14,7 +14,8 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
 # The kernels of the executed pages are local; their notes about encryption would fill the log.
-profile = Path(tempfile.mkdtemp()) / "profile_default"
+settings = tempfile.TemporaryDirectory()  # removed at the end
+profile = Path(settings.name) / "profile_default"
 profile.mkdir()
 (profile / "ipython_kernel_config.py").write_text("c.IPKernelApp.log_level = 40\n")
 os.environ["IPYTHONDIR"] = str(profile.parent)

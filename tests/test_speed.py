@@ -3,7 +3,7 @@
 Times are reported and never asserted. Answers and ratios of times are asserted. For a ratio two
 methods take turns in one test, and the least time of a query counts for each. Other load slows them
 unequally: a neighbour that uses the shared cache took a quarter of its speed from `pod-tensor`,
-which reads 2 MB of modes per query, and nothing from `pod`, which computes.
+which reads 2 MB of modes per query, and hardly anything from `pod`, which computes.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 
+from mor_bench.analysis.frontier import Point, median_error, median_latency_ms, non_dominated
 from mor_bench.report.cards import Card, method_card
 from mor_bench.report.method_styles import style_of
 from mor_bench.report.number_format import number, percent, short_swept
@@ -118,12 +119,9 @@ def curves_of(rows: list[Row]) -> dict[str, list[Row]]:
 
 def front_of(rows: list[Row]) -> list[Row]:
     """Return the rows that no other one of the group beats in latency and error, fastest first."""
-    ordered = sorted(rows, key=lambda row: next(zip(*_places([row]), strict=True)))
-    front: list[Row] = []
-    for row in ordered:
-        if not front or _places([row])[1] < _places(front[-1:])[1]:
-            front.append(row)
-    return front
+    points = [Point(median_latency_ms(row), median_error(row), row.label) for row in rows]
+    labels = {point.label: i for i, point in enumerate(non_dominated(points))}
+    return sorted((row for row in rows if row.label in labels), key=lambda row: labels[row.label])
 
 
 def blended(colour: str, share: float) -> str:

@@ -38,24 +38,7 @@ class Comparison(results.Comparison):
     """The results of a run, with pictures of them.
 
     `table` is a `pandas.DataFrame`. The functions `plot_…` draw on the given axes, or on new ones,
-    and return them.
-
-    Attributes
-    ----------
-    out : Path
-        The run's folder.
-    machine : dict
-        Processor, cores, versions.
-    rows : list of Row
-        One per configuration, in the order in which they ran.
-    datasets, methods : dict
-        Content of each dataset's and each method's file, by name.
-    learning : list of LearningPoint
-        Learning curves.
-    analysis : dict or None
-        Content of comparison.json.
-    settings : dict
-        Profile, split, limit, threads, budgets and version of the run.
+    and return them. See `mor_bench.results.comparison.Comparison` for the attributes.
 
     Examples
     --------

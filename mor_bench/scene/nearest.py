@@ -1,6 +1,6 @@
 """Search trees for the nearest of many points.
 
-SciPy's module is imported at the first tree: it would cost each start a quarter of its time.
+SciPy's module is imported at the first tree: it would lengthen each start.
 """
 
 from __future__ import annotations
