@@ -134,6 +134,7 @@ def test_a_downloaded_notebook_has_no_markup_of_the_site() -> None:
 
 
 def test_a_card_joins_configurations_of_one_kind_that_none_of_it_beats() -> None:
+    pytest.importorskip("sphinx", reason="needs the extra `docs`")
     import method_cards
 
     for name in ("deeponet", "quadratic-manifold-pod", "deim", "pod"):
