@@ -25,68 +25,74 @@ VISITS = 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def sweep_forward(indptr, indices, lower, inverses, b, x, r):
+def sweep_forward(indptr, indices, starts, blocks, b, x, r):
     """Solve (L + D) x = b, and write the residual b - (L + D + Lᵀ) x = -Lᵀ x to r."""
     r[:] = 0.0
     for i in range(len(indptr) - 1):
+        begin, n = indptr[i], indptr[i + 1] - indptr[i]
+        row = blocks[starts[i] : starts[i] + n + 2]
         s0, s1, s2 = b[3 * i], b[3 * i + 1], b[3 * i + 2]
-        for k in range(indptr[i], indptr[i + 1]):
-            K, j = lower[k], 3 * indices[k]
+        for k in range(n):
+            K, j = row[k], 3 * indices[begin + k]
             x0, x1, x2 = x[j], x[j + 1], x[j + 2]
             s0 -= K[0, 0] * x0 + K[0, 1] * x1 + K[0, 2] * x2
             s1 -= K[1, 0] * x0 + K[1, 1] * x1 + K[1, 2] * x2
             s2 -= K[2, 0] * x0 + K[2, 1] * x1 + K[2, 2] * x2
-        D = inverses[i]
+        D = row[n + 1]
         x0 = D[0, 0] * s0 + D[0, 1] * s1 + D[0, 2] * s2
         x1 = D[1, 0] * s0 + D[1, 1] * s1 + D[1, 2] * s2
         x2 = D[2, 0] * s0 + D[2, 1] * s1 + D[2, 2] * s2
         x[3 * i], x[3 * i + 1], x[3 * i + 2] = x0, x1, x2
-        for k in range(indptr[i], indptr[i + 1]):
-            K, j = lower[k], 3 * indices[k]
+        for k in range(n):
+            K, j = row[k], 3 * indices[begin + k]
             r[j] -= K[0, 0] * x0 + K[1, 0] * x1 + K[2, 0] * x2
             r[j + 1] -= K[0, 1] * x0 + K[1, 1] * x1 + K[2, 1] * x2
             r[j + 2] -= K[0, 2] * x0 + K[1, 2] * x1 + K[2, 2] * x2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def sweep_backward(indptr, indices, lower, inverses, b, x, above):
+def sweep_backward(indptr, indices, starts, blocks, b, x, above):
     """Improve x by one sweep of block Gauss-Seidel from the last row to the first.
 
     ``above`` receives Lᵀ x of the new x.
     """
     above[:] = 0.0
     for i in range(len(indptr) - 2, -1, -1):
+        begin, n = indptr[i], indptr[i + 1] - indptr[i]
+        row = blocks[starts[i] : starts[i] + n + 2]
         s0, s1, s2 = b[3 * i], b[3 * i + 1], b[3 * i + 2]
         s0, s1, s2 = s0 - above[3 * i], s1 - above[3 * i + 1], s2 - above[3 * i + 2]
-        for k in range(indptr[i], indptr[i + 1]):
-            K, j = lower[k], 3 * indices[k]
+        for k in range(n):
+            K, j = row[k], 3 * indices[begin + k]
             x0, x1, x2 = x[j], x[j + 1], x[j + 2]
             s0 -= K[0, 0] * x0 + K[0, 1] * x1 + K[0, 2] * x2
             s1 -= K[1, 0] * x0 + K[1, 1] * x1 + K[1, 2] * x2
             s2 -= K[2, 0] * x0 + K[2, 1] * x1 + K[2, 2] * x2
-        D = inverses[i]
+        D = row[n + 1]
         x0 = D[0, 0] * s0 + D[0, 1] * s1 + D[0, 2] * s2
         x1 = D[1, 0] * s0 + D[1, 1] * s1 + D[1, 2] * s2
         x2 = D[2, 0] * s0 + D[2, 1] * s1 + D[2, 2] * s2
         x[3 * i], x[3 * i + 1], x[3 * i + 2] = x0, x1, x2
-        for k in range(indptr[i], indptr[i + 1]):
-            K, j = lower[k], 3 * indices[k]
+        for k in range(n):
+            K, j = row[k], 3 * indices[begin + k]
             above[j] += K[0, 0] * x0 + K[1, 0] * x1 + K[2, 0] * x2
             above[j + 1] += K[0, 1] * x0 + K[1, 1] * x1 + K[2, 1] * x2
             above[j + 2] += K[0, 2] * x0 + K[1, 2] * x1 + K[2, 2] * x2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def subtract_product(indptr, indices, lower, diagonal, x, r):
+def subtract_product(indptr, indices, starts, blocks, x, r):
     """Subtract (L + D + Lᵀ) x from r."""
     for i in range(len(indptr) - 1):
-        D = diagonal[i]
+        begin, n = indptr[i], indptr[i + 1] - indptr[i]
+        row = blocks[starts[i] : starts[i] + n + 1]
+        D = row[n]
         x0, x1, x2 = x[3 * i], x[3 * i + 1], x[3 * i + 2]
         s0 = D[0, 0] * x0 + D[0, 1] * x1 + D[0, 2] * x2
         s1 = D[1, 0] * x0 + D[1, 1] * x1 + D[1, 2] * x2
         s2 = D[2, 0] * x0 + D[2, 1] * x1 + D[2, 2] * x2
-        for k in range(indptr[i], indptr[i + 1]):
-            K, j = lower[k], 3 * indices[k]
+        for k in range(n):
+            K, j = row[k], 3 * indices[begin + k]
             y0, y1, y2 = x[j], x[j + 1], x[j + 2]
             s0 += K[0, 0] * y0 + K[0, 1] * y1 + K[0, 2] * y2
             s1 += K[1, 0] * y0 + K[1, 1] * y1 + K[1, 2] * y2
@@ -100,25 +106,29 @@ def subtract_product(indptr, indices, lower, diagonal, x, r):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def restrict(indptr, indices, blocks, fine, coarse):
+def restrict(indptr, indices, starts, blocks, fine, coarse):
     """Write Pᵀ fine to ``coarse``."""
     coarse[:] = 0.0
     for i in range(len(indptr) - 1):
+        begin, n = indptr[i], indptr[i + 1] - indptr[i]
+        row = blocks[starts[i] : starts[i] + n]
         x0, x1, x2 = fine[3 * i], fine[3 * i + 1], fine[3 * i + 2]
-        for k in range(indptr[i], indptr[i + 1]):
-            P, j = blocks[k], 3 * indices[k]
+        for k in range(n):
+            P, j = row[k], 3 * indices[begin + k]
             coarse[j] += P[0, 0] * x0 + P[1, 0] * x1 + P[2, 0] * x2
             coarse[j + 1] += P[0, 1] * x0 + P[1, 1] * x1 + P[2, 1] * x2
             coarse[j + 2] += P[0, 2] * x0 + P[1, 2] * x1 + P[2, 2] * x2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def prolong(indptr, indices, blocks, coarse, fine):
+def prolong(indptr, indices, starts, blocks, coarse, fine):
     """Add P coarse to ``fine``."""
     for i in range(len(indptr) - 1):
+        begin, n = indptr[i], indptr[i + 1] - indptr[i]
+        row = blocks[starts[i] : starts[i] + n]
         s0, s1, s2 = fine[3 * i], fine[3 * i + 1], fine[3 * i + 2]
-        for k in range(indptr[i], indptr[i + 1]):
-            P, j = blocks[k], 3 * indices[k]
+        for k in range(n):
+            P, j = row[k], 3 * indices[begin + k]
             x0, x1, x2 = coarse[j], coarse[j + 1], coarse[j + 2]
             s0 += P[0, 0] * x0 + P[0, 1] * x1 + P[0, 2] * x2
             s1 += P[1, 0] * x0 + P[1, 1] * x1 + P[1, 2] * x2
@@ -126,54 +136,104 @@ def prolong(indptr, indices, blocks, coarse, fine):
         fine[3 * i], fine[3 * i + 1], fine[3 * i + 2] = s0, s1, s2
 
 
-Blocks = tuple[NDArray[np.int32], NDArray[np.int32], Floats]
+Rows = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], Floats]
+"""Row pointers (n + 1,), columns (n_entries,), where each row's blocks begin (n,), and blocks."""
+
+SAME = 3e-5
+"""Largest difference of equal rows, relative to their largest entry."""
+N_KEYS = 3
+"""Combinations that find equal rows; with one, many rows are compared with the wrong one."""
 
 
 @dataclass(frozen=True)
 class Level:
     """One level above the coarsest.
 
+    On a regular grid most rows have equal blocks, which are stored once: they stay in the cache.
+
     Attributes
     ----------
     lower : tuple of arrays
-        Row pointers, columns and blocks left of the diagonal, (n_blocks, 3, 3).
-    diagonal, inverses : (n / 3, 3, 3) floats
-        Blocks of the diagonal, and their inverses.
+        Rows left of the diagonal. Behind the blocks of a row are that of the diagonal, and its
+        inverse.
     prolongation : tuple of arrays
-        Row pointers, columns and blocks of P.
+        Rows of P.
+    n_coarse : int
+        Number of columns of P.
     """
 
-    lower: Blocks
-    diagonal: Floats
-    inverses: Floats
-    prolongation: Blocks
+    lower: Rows
+    prolongation: Rows
     n_coarse: int
 
     @property
     def multiply_adds(self) -> int:
         """Work of the sweeps and transfers of one visit, and of the residual between two."""
-        lower, P = 9 * len(self.lower[1]), 9 * len(self.prolongation[1])
-        return 6 * lower + 3 * self.diagonal.size + 2 * P
+        n, lower, P = len(self.lower[2]), 9 * len(self.lower[1]), 9 * len(self.prolongation[1])
+        return 6 * lower + 27 * n + 2 * P
+
+
+def _stored_once(counts: NDArray[np.int64], blocks: Floats) -> tuple[NDArray[np.int32], Floats]:
+    """Return where the blocks of each row begin, and the blocks of the rows that differ.
+
+    Parameters
+    ----------
+    counts : (n,) int
+        Number of blocks of each row.
+    blocks : (n_blocks, 3, 3) floats
+        Row after row.
+    """
+    n, begins = len(counts), np.cumsum(counts) - counts
+    rows = np.repeat(np.arange(n), counts)
+    within = np.arange(len(blocks)) - begins[rows]
+    size = np.zeros(n)
+    np.maximum.at(size, rows, np.abs(blocks).max(axis=(1, 2), initial=0.0))
+    size[size == 0] = 1.0
+    # Random combinations of the entries find candidates, which are compared entry by entry.
+    random = np.random.default_rng(0)
+    of_entry = random.uniform(-1, 1, (9, N_KEYS))
+    of_place = random.uniform(-1, 1, (int(counts.max(initial=0)), N_KEYS))
+    parts = (blocks.reshape(-1, 9) @ of_entry) * of_place[within] / size[rows, None]
+    sums = [np.log(size), *(np.bincount(rows, part, n) for part in parts.T)]
+    keys = np.stack([counts, *(np.round(values / (10 * SAME)) for values in sums)])
+    _, first, group = np.unique(keys, axis=1, return_index=True, return_inverse=True)
+    equal = first[group.ravel()]
+    others = blocks[begins[equal][rows] + within]
+    differs = rows[np.abs(blocks - others).max(axis=(1, 2), initial=0.0) > SAME * size[rows]]
+    equal[differs] = differs
+    kept, kind = np.unique(equal, return_inverse=True)
+    new_begins = np.cumsum(counts[kept]) - counts[kept]
+    places = np.repeat(begins[kept] - new_begins, counts[kept])
+    return new_begins[kind].astype(np.int32), blocks[places + np.arange(len(places))]
 
 
 def level_of(matrix: Any, prolongation: Any, dtype: Any) -> Level:
     """Return the level of a symmetric sparse matrix and its prolongation, in a precision."""
-    blocks = sp.csr_matrix(matrix).tobsr(blocksize=(3, 3))
-    blocks.sort_indices()
-    n = len(blocks.indptr) - 1
-    rows = np.repeat(np.arange(n), np.diff(blocks.indptr))
-    left, on = blocks.indices < rows, blocks.indices == rows
-    indptr = np.append(0, np.cumsum(np.bincount(rows[left], minlength=n))).astype(np.int32)
-    diagonal = np.zeros((n, 3, 3))
-    diagonal[rows[on]] = blocks.data[on]
+    found = sp.csr_matrix(matrix).tobsr(blocksize=(3, 3))
+    found.sort_indices()
+    n = len(found.indptr) - 1
+    rows = np.repeat(np.arange(n), np.diff(found.indptr))
+    left, on = found.indices < rows, found.indices == rows
+    counts = np.bincount(rows[left], minlength=n)
+    indptr = np.append(0, np.cumsum(counts))
+    blocks = np.zeros((indptr[-1] + 2 * n, 3, 3))
+    blocks[np.arange(indptr[-1]) + 2 * rows[left]] = found.data[left]
+    blocks[indptr[1:][rows[on]] + 2 * rows[on]] = found.data[on]
+    begins, stored = _stored_once(counts + 2, blocks)
+    diagonals = np.unique(begins + counts)
     # An aggregate of one or two nodes has fewer than six motions; the others have zero rows.
-    inverses = np.linalg.pinv(diagonal, rcond=1e-10, hermitian=True)
+    stored[diagonals + 1] = np.linalg.pinv(stored[diagonals], rcond=1e-10, hermitian=True)
     P = sp.csr_matrix(prolongation).tobsr(blocksize=(3, 3))
+    P.sort_indices()
+    P_begins, P_stored = _stored_once(np.diff(P.indptr), P.data)
     return Level(
-        (indptr, blocks.indices[left].astype(np.int32), blocks.data[left].astype(dtype)),
-        diagonal.astype(dtype),
-        inverses.astype(dtype),
-        (P.indptr.astype(np.int32), P.indices.astype(np.int32), P.data.astype(dtype)),
+        (
+            indptr.astype(np.int32),
+            found.indices[left].astype(np.int32),
+            begins,
+            stored.astype(dtype),
+        ),
+        (P.indptr.astype(np.int32), P.indices.astype(np.int32), P_begins, P_stored.astype(dtype)),
         int(P.shape[1]),
     )
 
@@ -204,7 +264,7 @@ class Cycle:
             return np.asarray(self._coarsest @ b)
         level = self._levels[depth]
         x, left = np.empty_like(b), np.empty_like(b)
-        sweep_forward(*level.lower, level.inverses, b, x, left)
+        sweep_forward(*level.lower, b, x, left)
         coarse = np.empty(level.n_coarse, dtype=b.dtype)
         restrict(*level.prolongation, left, coarse)
         found = self(coarse, depth + 1)
@@ -212,8 +272,8 @@ class Cycle:
             below = self._levels[depth + 1]
             for _ in range(VISITS - 1):
                 left_below = coarse.copy()
-                subtract_product(*below.lower, below.diagonal, found, left_below)
+                subtract_product(*below.lower, found, left_below)
                 found += self(left_below, depth + 1)
         prolong(*level.prolongation, found, x)
-        sweep_backward(*level.lower, level.inverses, b, x, left)
+        sweep_backward(*level.lower, b, x, left)
         return x

@@ -67,8 +67,8 @@ cholesky, superlu, pardiso
 Meshes whose band exceeds `MAX_BAND_ENTRIES` use multigrid instead of a rest-state factor.
 """
 
-MAX_BAND_ENTRIES = 1e8
-"""Largest number of entries of a banded rest-state factor (0.8 GB); larger meshes use multigrid."""
+MAX_BAND_ENTRIES = 5e7
+"""Largest number of entries of a banded rest-state factor (0.4 GB); larger meshes use multigrid."""
 
 PCG_FROM = 3000
 """Number of unknowns above which conjugate gradients beat a banded factor per Newton step."""

@@ -305,3 +305,21 @@ def test_a_multigrid_cycle_equals_its_definition_with_dense_matrices() -> None:
     cycle, b = Cycle(levels, np.linalg.inv(matrices[2])), rng.normal(size=len(matrices[0]))
     wanted = defined(0, b)
     np.testing.assert_allclose(cycle(b), wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_equal_rows_of_a_multigrid_level_are_stored_once(scaled: bool) -> None:
+    """On a regular grid, each row equals the stored one, also where one node differs a little."""
+    model = beam_across(5)
+    K = dense(model.assembler, model.rest_tangent)
+    if scaled:
+        K[30:33] *= 1.001
+        K[:, 30:33] *= 1.001
+    indptr, columns, begins, blocks = level_of(K, np.eye(len(K)), np.float64).lower
+    assert len(blocks) < 0.5 * len(columns)
+    for i, begin in enumerate(begins):
+        own = 3 * columns[indptr[i] : indptr[i + 1]]
+        row = np.stack([K[3 * i : 3 * i + 3, j : j + 3] for j in [*own, 3 * i]])
+        stored = blocks[begin : begin + len(row)]
+        np.testing.assert_allclose(stored, row, rtol=0, atol=4e-5 * np.abs(row).max())
+        np.testing.assert_allclose(blocks[begin + len(row)] @ stored[-1], np.eye(3), atol=1e-8)
