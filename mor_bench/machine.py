@@ -31,17 +31,46 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
+_kernel_threads = 1
+
+
+def kernel_threads() -> int:
+    """Return the number of threads of compiled kernels, one unless `pinned_threads` sets it."""
+    return _kernel_threads
+
+
 @contextmanager
 def pinned_threads(threads: int) -> Iterator[None]:
-    """Limit the threads of BLAS, OpenMP and, if it is loaded, torch."""
+    """Set the threads of BLAS, OpenMP, compiled kernels and, if it is loaded, torch.
+
+    Compiled kernels use more than one thread on large meshes only.
+
+    Parameters
+    ----------
+    threads : int
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> from mor_bench.machine import pinned_threads
+    >>> scene = mor_bench.load_scene("beam-tiny")
+    >>> method = mor_bench.load_method("fem").fit(scene, None)
+    >>> with pinned_threads(2):
+    ...     displacements = method.predict(0.0 * scene.mesh.points)
+    >>> displacements.shape
+    (63, 3)
+    """
+    global _kernel_threads
     torch: Any = sys.modules.get("torch")
-    before = torch.get_num_threads() if torch else None
+    before, kernels_before = torch.get_num_threads() if torch else None, _kernel_threads
     with threadpool_limits(threads):
         if torch:
             torch.set_num_threads(threads)
+        _kernel_threads = threads
         try:
             yield
         finally:
+            _kernel_threads = kernels_before
             if torch:
                 torch.set_num_threads(before)
 

@@ -31,11 +31,18 @@ from mor_bench.mechanics.kernels import (
 )
 from mor_bench.mechanics.laws import general_force, general_multiply_adds
 from mor_bench.mechanics.pattern import Pattern, build_pattern
+from mor_bench.mechanics.slabs import Slabs, slabs_of
 from mor_bench.mechanics.turned import TurnedDofs
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.supports import Frames
 
 Array = NDArray[np.float64]
+
+Batches = tuple[Array, Array, Array, NDArray[np.int32]]
+"""Gradients, two arrays of the kernel of the law, and slots of batches of cells."""
+
+PARALLEL_FROM = 512
+"""Batches of cells from which they are summed in slabs."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +139,9 @@ class Assembler:
         self._dof_of_node, self._own, self._frames = dof_of_node, own, frames
         self._dofs = _batched(dofs.astype(np.int32), self._n_summed)
         self._slots = _batched(slots, len(self.summed_pattern.indices))
+        self._slabs: Slabs | None = None
+        if len(self._dofs) >= PARALLEL_FROM:
+            self._slabs = slabs_of(len(self._dofs), self._touched)
         gradients = distinct(quadrature.gradients.reshape(n_cells, n_points, 3 * n_nodes), LANES)
         self._gradients = _batched(gradients, 0.0).reshape(-1, n_points, 3 * n_nodes * LANES)
         self._rule = quadrature.weights
@@ -173,6 +183,7 @@ class Assembler:
             self._weights = _batched(weights, 0.0)
             self._parameters = np.repeat(parameters, LANES, axis=1)
             per_point = general_multiply_adds(material.law, parameters.shape[1], n_nodes)
+        self._batches = self._chosen(slice(None))
         self._multiply_adds = n_cells * n_points * per_point[0], n_cells * n_points * per_point[1]
         self._plain = body.springs is None and body.rest is None and self._frames is None
         self._springs: tuple[sp.csr_array, NDArray[np.int64], Array] | None = None
@@ -208,18 +219,45 @@ class Assembler:
         if is_counting():
             work = self._multiply_adds[len(values) > 0]
             count(element_evaluations=self.n_cells, multiply_adds=work)
-        gradients = self._gradients
+        if self._slabs is None:
+            return self._sum_of(u, dofs, self._batches, force, values)
+
+        def sum_of(first: int, last: int) -> tuple[float, float]:
+            chosen = slice(first, last)
+            return self._sum_of(u, dofs[chosen], self._chosen(chosen), force, values)
+
+        energies, min_dets = zip(*self._slabs.run(sum_of), strict=True)
+        return sum(energies), min(min_dets)
+
+    def _chosen(self, chosen: slice) -> Batches:
+        """Return the data of some batches of cells."""
+        # One batch of gradients serves all if cells are equal.
+        own = len(self._gradients) == len(self._dofs)
+        gradients = self._gradients[chosen] if own else self._gradients
+        if self._has_own_kernel:
+            return gradients, self._w_lam[chosen], self._w_mu[chosen], self._slots[chosen]
+        return gradients, self._weights[chosen], self._parameters, self._slots[chosen]
+
+    def _sum_of(
+        self, u: Array, dofs: NDArray[np.int32], batches: Batches, force: Array, values: Array
+    ) -> tuple[float, float]:
+        """Add forces and tangents of batches of cells; return energy and min det F."""
+        gradients, second, third, slots = batches
+        cells = gradients, second, third
         out: tuple[float, float]
         if not self._has_own_kernel:
-            tangent = (self._slots, force, values) if len(values) else (None, force, None)
-            out = self._kernel(u, dofs, gradients, self._weights, self._parameters, *tangent)
+            tangent = (slots, force, values) if len(values) else (None, force, None)
+            out = self._kernel(u, dofs, *cells, *tangent)
         elif len(values) == 0:
-            out = internal_force(u, dofs, gradients, self._w_lam, self._w_mu, force)
+            out = internal_force(u, dofs, *cells, force)
         else:
-            out = internal_force_and_tangent(
-                u, dofs, gradients, self._w_lam, self._w_mu, self._slots, force, values
-            )
+            out = internal_force_and_tangent(u, dofs, *cells, slots, force, values)
         return out
+
+    def _touched(self, first: int, last: int) -> NDArray[np.int32]:
+        """Return the dofs of some batches of cells."""
+        dofs = self._dofs[first:last]
+        return np.asarray(dofs[dofs < self._n_summed])
 
     def _sum_all(self, total: Array, force: Array, values: Array) -> tuple[float, float]:
         """Add forces and tangents of cells and springs; return energy and min det F."""

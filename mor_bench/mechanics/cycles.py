@@ -18,6 +18,8 @@ import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
+from mor_bench.mechanics.slabs import Slabs, are_apart, slabs_of, whole
+
 Floats = NDArray[np.floating[Any]]
 
 VISITS = 2
@@ -25,10 +27,9 @@ VISITS = 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def sweep_forward(indptr, indices, starts, blocks, b, x, r):
-    """Solve (L + D) x = b, and write the residual b - (L + D + Lᵀ) x = -Lᵀ x to r."""
-    r[:] = 0.0
-    for i in range(len(indptr) - 1):
+def sweep_forward(indptr, indices, starts, blocks, b, x, r, first, last):
+    """Solve rows of (L + D) x = b, and add the residual b - (L + D + Lᵀ) x = -Lᵀ x to r."""
+    for i in range(first, last):
         begin, n = indptr[i], indptr[i + 1] - indptr[i]
         row = blocks[starts[i] : starts[i] + n + 2]
         s0, s1, s2 = b[3 * i], b[3 * i + 1], b[3 * i + 2]
@@ -51,13 +52,12 @@ def sweep_forward(indptr, indices, starts, blocks, b, x, r):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def sweep_backward(indptr, indices, starts, blocks, b, x, above):
-    """Improve x by one sweep of block Gauss-Seidel from the last row to the first.
+def sweep_backward(indptr, indices, starts, blocks, b, x, above, first, last):
+    """Improve x by one sweep of block Gauss-Seidel over rows, from the last to the first.
 
-    ``above`` receives Lᵀ x of the new x.
+    Lᵀ x of the new x is added to ``above``.
     """
-    above[:] = 0.0
-    for i in range(len(indptr) - 2, -1, -1):
+    for i in range(last - 1, first - 1, -1):
         begin, n = indptr[i], indptr[i + 1] - indptr[i]
         row = blocks[starts[i] : starts[i] + n + 2]
         s0, s1, s2 = b[3 * i], b[3 * i + 1], b[3 * i + 2]
@@ -106,10 +106,9 @@ def subtract_product(indptr, indices, starts, blocks, x, r):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def restrict(indptr, indices, starts, blocks, fine, coarse):
-    """Write Pᵀ fine to ``coarse``."""
-    coarse[:] = 0.0
-    for i in range(len(indptr) - 1):
+def restrict(indptr, indices, starts, blocks, fine, coarse, first, last):
+    """Add Pᵀ fine of some rows to ``coarse``."""
+    for i in range(first, last):
         begin, n = indptr[i], indptr[i + 1] - indptr[i]
         row = blocks[starts[i] : starts[i] + n]
         x0, x1, x2 = fine[3 * i], fine[3 * i + 1], fine[3 * i + 2]
@@ -121,9 +120,9 @@ def restrict(indptr, indices, starts, blocks, fine, coarse):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def prolong(indptr, indices, starts, blocks, coarse, fine):
-    """Add P coarse to ``fine``."""
-    for i in range(len(indptr) - 1):
+def prolong(indptr, indices, starts, blocks, coarse, fine, first, last):
+    """Add P coarse to some rows of ``fine``."""
+    for i in range(first, last):
         begin, n = indptr[i], indptr[i + 1] - indptr[i]
         row = blocks[starts[i] : starts[i] + n]
         s0, s1, s2 = fine[3 * i], fine[3 * i + 1], fine[3 * i + 2]
@@ -141,6 +140,8 @@ Rows = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], Floats]
 
 SAME = 3e-5
 """Largest difference of equal rows, relative to their largest entry."""
+PARALLEL_FROM = 20_000
+"""Rows from which a level is divided into slabs."""
 N_KEYS = 3
 """Combinations that find equal rows; with one, many rows are compared with the wrong one."""
 
@@ -160,11 +161,16 @@ class Level:
         Rows of P.
     n_coarse : int
         Number of columns of P.
+    slabs, restriction : Slabs
+        Rows that sweeps, and the restriction, take at the same time. "Left of the diagonal" is
+        what a forward sweep meets first.
     """
 
     lower: Rows
     prolongation: Rows
     n_coarse: int
+    slabs: Slabs
+    restriction: Slabs
 
     @property
     def multiply_adds(self) -> int:
@@ -207,13 +213,23 @@ def _stored_once(counts: NDArray[np.int64], blocks: Floats) -> tuple[NDArray[np.
     return new_begins[kind].astype(np.int32), blocks[places + np.arange(len(places))]
 
 
+def columns_of(matrix: Any, first: int, last: int) -> NDArray[np.int32]:
+    """Return the columns of a sparse matrix' blocks in some rows."""
+    return np.asarray(matrix.indices[matrix.indptr[first] : matrix.indptr[last]])
+
+
 def level_of(matrix: Any, prolongation: Any, dtype: Any) -> Level:
     """Return the level of a symmetric sparse matrix and its prolongation, in a precision."""
     found = sp.csr_matrix(matrix).tobsr(blocksize=(3, 3))
     found.sort_indices()
     n = len(found.indptr) - 1
+    slabs = whole(n)
+    if n >= PARALLEL_FROM:
+        slabs = slabs_of(n, lambda first, last: columns_of(found, first, last))
+    turn = np.empty(n, dtype=np.int64)
+    turn[np.concatenate(slabs.run_all(np.arange))] = np.arange(n)
     rows = np.repeat(np.arange(n), np.diff(found.indptr))
-    left, on = found.indices < rows, found.indices == rows
+    left, on = turn[found.indices] < turn[rows], found.indices == rows
     counts = np.bincount(rows[left], minlength=n)
     indptr = np.append(0, np.cumsum(counts))
     blocks = np.zeros((indptr[-1] + 2 * n, 3, 3))
@@ -226,6 +242,9 @@ def level_of(matrix: Any, prolongation: Any, dtype: Any) -> Level:
     P = sp.csr_matrix(prolongation).tobsr(blocksize=(3, 3))
     P.sort_indices()
     P_begins, P_stored = _stored_once(np.diff(P.indptr), P.data)
+    apart = all(
+        are_apart(group, lambda first, last: columns_of(P, first, last)) for group in slabs.groups
+    )
     return Level(
         (
             indptr.astype(np.int32),
@@ -235,6 +254,8 @@ def level_of(matrix: Any, prolongation: Any, dtype: Any) -> Level:
         ),
         (P.indptr.astype(np.int32), P.indices.astype(np.int32), P_begins, P_stored.astype(dtype)),
         int(P.shape[1]),
+        slabs,
+        slabs if apart else whole(n),
     )
 
 
@@ -263,10 +284,10 @@ class Cycle:
         if depth == len(self._levels):
             return np.asarray(self._coarsest @ b)
         level = self._levels[depth]
-        x, left = np.empty_like(b), np.empty_like(b)
-        sweep_forward(*level.lower, b, x, left)
-        coarse = np.empty(level.n_coarse, dtype=b.dtype)
-        restrict(*level.prolongation, left, coarse)
+        x, left, above = np.empty_like(b), np.zeros_like(b), np.zeros_like(b)
+        coarse = np.zeros(level.n_coarse, dtype=b.dtype)
+        level.slabs.run(lambda *rows: sweep_forward(*level.lower, b, x, left, *rows))
+        level.restriction.run(lambda *rows: restrict(*level.prolongation, left, coarse, *rows))
         found = self(coarse, depth + 1)
         if depth + 1 < len(self._levels):
             below = self._levels[depth + 1]
@@ -274,6 +295,8 @@ class Cycle:
                 left_below = coarse.copy()
                 subtract_product(*below.lower, found, left_below)
                 found += self(left_below, depth + 1)
-        prolong(*level.prolongation, found, x)
-        sweep_backward(*level.lower, b, x, left)
+        level.slabs.run_all(lambda *rows: prolong(*level.prolongation, found, x, *rows))
+        level.slabs.run(
+            lambda *rows: sweep_backward(*level.lower, b, x, above, *rows), backward=True
+        )
         return x

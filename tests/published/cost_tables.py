@@ -47,15 +47,16 @@ def probe_cost(source: str) -> str:
 
 def scaling(source: str) -> str:
     """Show the cost of a solve against the number of unknowns."""
-    headings = ["unknowns", "rest state", "set-up, s", "solve, ms", "iterations", "peak MB"]
+    headings = ["unknowns", "rest state", "set-up, s", "solve, ms", "on two threads, ms"]
     return markdown(
-        headings,
+        [*headings, "iterations", "peak MB"],
         [
             [
                 f"{row['unknowns']:,}",
                 "banded" if "Banded" in row["rest_state"] else "multigrid",
                 f"{row['set_up_s']:.1f}",
                 number(1e3 * row["solve_s"]),
+                number(1e3 * row["two_threads_s"]),
                 f"{row['iterations']:.0f}",
                 number(row["peak_mb"]),
             ]

@@ -28,6 +28,7 @@ from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.sampling_tables import learning_curves
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
+from tests.published.training_curve_tables import training_iterations, training_samples
 
 
 def _medians(row: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -362,4 +363,6 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "projections": projections,
     "reconstructions": reconstructions,
     "learning-curves": learning_curves,
+    "training-iterations": training_iterations,
+    "training-samples": training_samples,
 }
