@@ -171,9 +171,12 @@ class Acting:
 
     def points(self, patches: NDArray[np.int64]) -> tuple[NDArray[np.float64], sp.csr_array]:
         """Return the tractions of some patches as forces at points, see `Scene.patch_points`."""
-        areas = self.patches.areas[patches]
+        found = self.patches
+        if isinstance(self.plan, Pressure) and not self.ground.embedded:
+            found = pressed_patches(self.ground.surface, self.pressed_facets, fine=True)
+        areas = found.areas[patches]
         used = np.unique(areas.indices)
-        return self.patches.points[used], self._weights(areas[:, used])
+        return found.points[used], self._weights(areas[:, used])
 
     def _weights(self, areas: sp.csr_array) -> sp.csr_array:
         """Return the weights of patches from their areas: shares, or those of a pressure."""

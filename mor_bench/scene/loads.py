@@ -24,6 +24,8 @@ POINTS_PER_PATCH = 256
 POINTS_PER_LINE = 1024
 """Quadrature points of a line. A midpoint rule gives the resultant and its moment exactly."""
 
+FINE_PARTS = 16
+"""Parts of an edge of a pressed facet, for meshes whose facets are divided."""
 MAX_SURFACE_POINTS = 200_000
 """Largest number of quadrature points. A patch that needs more is tiny compared with its facet."""
 
@@ -145,12 +147,23 @@ def cut_patches(
     return Patches(shares, rule.points, rule.values, rule.vectors / areas[:, None])
 
 
-def pressed_patches(surface: Facets, regions: Sequence[NDArray[np.int64]]) -> Patches:
+def pressed_patches(
+    surface: Facets, regions: Sequence[NDArray[np.int64]], *, fine: bool = False
+) -> Patches:
     """Return three patches for each region of facets: the parts of a pressure along x, y and z.
 
     The "areas" of patch 3 k + i are the components i of the area vectors of region k. Their sum is
     that of the closed surface's normal, so it may be zero or negative. A pressure p on the region
     is the traction -p e_i on each of its patches.
+
+    Parameters
+    ----------
+    surface : Facets
+    regions : sequence of (n_facets, n_corners) int64
+        Facets of each region.
+    fine : bool
+        Whether the points serve meshes with divided facets too. Few points per facet give the
+        consistent load of its own mesh, and forces at single nodes of a fine one.
 
     Raises
     ------
@@ -162,7 +175,12 @@ def pressed_patches(surface: Facets, regions: Sequence[NDArray[np.int64]]) -> Pa
             "a region of `loads.regions` holds nodes but no facet of the surface, so no pressure "
             "can act on it."
         )
-    rules = [_quadrature(surface, facets, _area(surface, facets)) for facets in regions]
+    if fine:
+        rules = [
+            _divided_rule(surface, facets, _fine_spacing(surface, facets)) for facets in regions
+        ]
+    else:
+        rules = [_quadrature(surface, facets, _area(surface, facets)) for facets in regions]
     vectors = [rule.vectors for rule in rules]
     areas = np.concatenate([np.linalg.norm(v, axis=1) for v in vectors])
     return Patches(
@@ -273,6 +291,13 @@ def _quadrature(surface: Facets, facets: NDArray[np.int64], area_m2: float) -> _
         f"`patch_area_m2` must be at least about {least:.3g} m², because facets have edges "
         f"of up to {longest:.3g} m; got {area_m2}."
     )
+
+
+def _fine_spacing(surface: Facets, facets: NDArray[np.int64]) -> float:
+    """Return the distance of points, m, that divides edges into `FINE_PARTS`, or fewer parts."""
+    per_part = len(DEGREE_2) if facets.shape[1] == 6 else 1
+    most = int(sqrt(MAX_SURFACE_POINTS / (len(facets) * per_part)))
+    return _longest_edge(surface.points[corners_of(facets)]) / max(1, min(FINE_PARTS, most))
 
 
 def _longest_edge(corners: NDArray[np.float64]) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.scene.scene import Scene, scene_without_patches
+from mor_bench.scene.springs import on_parts
 from mor_bench.scene.subdivision import subdivide
 from mor_bench.scene.supports import Held, held_by_parents
 from mor_bench.specs import BoxGeometry, ChamberedGeometry, LShapeGeometry
@@ -85,9 +86,14 @@ def refined(scene: Scene) -> Scene:
     }
     held = Held(scene.fixed_nodes, scene.held_dofs, scene.frames)
     finer = held_by_parents(scene.mesh.n_nodes, held, parents)
+    springs = scene.springs
+    if scene.embedded_surface is None:
+        of_file = zip(springs, scene.generated.springs, strict=True)
+        springs = tuple(on_parts(own, spring, mesh, parents) for own, spring in of_file)
     return replace(
         scene,
         mesh=mesh,
+        springs=springs,
         fixed_nodes=finer.fixed_nodes,
         held_dofs=finer.held_dofs,
         frames=finer.frames,

@@ -16,6 +16,7 @@ from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.scene.triangle_rules import DEGREE_4, DEGREE_4_WEIGHTS, quadratic_triangle
 from mor_bench.specs import AXES, DatasetSpec
+from mor_bench.specs.support_spec import Spring
 
 _X, _W = np.polynomial.legendre.leggauss(3)
 _SIXTHS = np.full((3, 3), 1.0 / 6.0) + 0.5 * np.eye(3)
@@ -24,7 +25,7 @@ _SIXTHS = np.full((3, 3), 1.0 / 6.0) + 0.5 * np.eye(3)
 
 @dataclass(frozen=True)
 class Springs:
-    """Springs at the quadrature points of a surface, which do not depend on the mesh.
+    """Springs at the quadrature points of a surface.
 
     Attributes
     ----------
@@ -32,10 +33,13 @@ class Springs:
         Positions, m.
     stiffness : (n, 3, 3) float64
         Force per displacement, N/m.
+    facets : (n_facets, n_corners) int64
+        Facets of the surface.
     """
 
     points: NDArray[np.float64]
     stiffness: NDArray[np.float64]
+    facets: NDArray[np.int64]
 
     def matrix(self, mesh: Mesh) -> sp.csr_array:
         """Return the stiffness over the nodal dofs of a mesh, (n_dofs, n_dofs), N/m."""
@@ -60,14 +64,39 @@ def foundations(
         facets = surface.within(region_points(cloud, spring.region))
         if len(facets) == 0:
             raise SpecError("a region of `springs` holds no facet of the surface.")
-        points, vectors, _ = surface_quadrature(surface, facets)
-        areas = np.linalg.norm(vectors, axis=1)[:, None, None]
-        if spring.normal:
-            directions = vectors[:, :, None] * vectors[:, None] / areas
-        else:
-            directions = areas * np.diag([float(axis in spring.components) for axis in AXES])
-        found.append(Springs(points, spring.stiffness_n_m3 * directions))
+        found.append(_on_facets(spring, surface, facets))
     return tuple(found)
+
+
+def _on_facets(spring: Spring, surface: Facets, facets: NDArray[np.int64]) -> Springs:
+    points, vectors, _ = surface_quadrature(surface, facets)
+    areas = np.linalg.norm(vectors, axis=1)[:, None, None]
+    if spring.normal:
+        directions = vectors[:, :, None] * vectors[:, None] / areas
+    else:
+        directions = areas * np.diag([float(axis in spring.components) for axis in AXES])
+    return Springs(points, spring.stiffness_n_m3 * directions, facets)
+
+
+def on_parts(springs: Springs, spring: Spring, mesh: Mesh, parents: NDArray[np.int64]) -> Springs:
+    """Return the springs on the parts of their facets, on a mesh whose cells were divided.
+
+    At the points of the whole facets, they would be springs of single nodes on a fine mesh.
+
+    Parameters
+    ----------
+    springs : Springs
+        Springs on the boundary of the mesh before.
+    spring : Spring
+        Their part of the dataset file.
+    mesh : Mesh
+        The mesh with divided cells.
+    parents : (n_nodes, n) int64
+        Nodes of the mesh before, between which each node lies.
+    """
+    surface = Facets(mesh.points, mesh.boundary_facets)
+    nodes = np.flatnonzero(np.isin(parents, springs.facets).all(axis=1))
+    return _on_facets(spring, surface, surface.within(nodes))
 
 
 def surface_quadrature(

@@ -15,6 +15,8 @@ from mor_bench.hard_cases.setups import material_table
 from mor_bench.measure.discretisation_error import RefinementPlan, refine
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.scene.interpolation import interpolation_matrix
+from mor_bench.scene.other_meshes import refined
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.sampling import draw_loads
@@ -178,6 +180,17 @@ def test_named_sets_and_the_discretisation_error_exist(tmp_path: Path) -> None:
     held = pressed(supports=[{"region": "x-min"}], loads=below_buckling).generated
     record = refine(held, RefinementPlan(2, 1), cache=tmp_path)
     assert 0.0 < record["relative_l2"] < 0.3
+
+
+@pytest.mark.parametrize("discretisation", [None, {"element": "tetrahedron"}])
+def test_a_pressure_on_divided_cells_is_their_own_consistent_load(discretisation: Any) -> None:
+    """Forces at few points of a facet would dent the divided one."""
+    scene = pressed(discretisation=discretisation) if discretisation else tube(2, YOUNG_PA)
+    finer = refined(refined(scene))
+    points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))
+    found = (shares @ interpolation_matrix(finer.mesh, points)).toarray()
+    wanted = finer.patch_weights.toarray()
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=0.02 * np.abs(wanted).max())
 
 
 @pytest.mark.slow

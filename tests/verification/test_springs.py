@@ -17,8 +17,11 @@ from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.mechanics.relaxation import DynamicRelaxation
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.tensors import TensorProblem
+from mor_bench.scene.loads import Facets
 from mor_bench.scene.mesh import Mesh
+from mor_bench.scene.other_meshes import refined
 from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.scene.springs import foundations
 from mor_bench.scene.symmetry import mirrors
 from mor_bench.specs import load_generated_spec
 from mor_bench.surrogates.hyper_reduced import nodal, reduced_points
@@ -221,6 +224,21 @@ def test_springs_have_the_area_of_their_surface_on_any_mesh() -> None:
         load = np.ones(3 * scene.mesh.n_nodes)
         force = FullOrderModel(scene).force(1e-9 * load[scene.free_dofs]).force
         assert force.sum() == pytest.approx(3e-9 * 200.0 * area, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["artery-pressure", "liver-pressed"])
+def test_springs_lie_on_the_surface_of_divided_cells(name: str) -> None:
+    """They are those of a foundation on it; on an embedded surface they stay."""
+    scene = load_scene(name)
+    finer = refined(refined(scene))
+    assert scene.spring_matrix is not None
+    assert finer.spring_matrix is not None
+    own = Facets(finer.mesh.points, finer.mesh.boundary_facets)
+    surface = finer.embedded_surface or own
+    (wanted,) = foundations(finer.generated, surface, finer.point_sets)
+    found, expected = finer.spring_matrix, wanted.matrix(finer.mesh)
+    assert abs(found - expected).max() <= 1e-12 * abs(expected).max()
+    assert found.sum() == pytest.approx(scene.spring_matrix.sum(), rel=1e-10)
 
 
 @pytest.mark.parametrize(
