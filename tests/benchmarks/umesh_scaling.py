@@ -1,4 +1,4 @@
-"""Train U-Meshes of several sizes for several numbers of iterations, for a scaling law.
+"""Train U-Meshes of several sizes for several numbers of iterations, for scaling laws.
 
     python -m tests.benchmarks.umesh_scaling --json umesh-scaling.json
 
@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 import mor_bench
@@ -37,48 +38,63 @@ PAPER = {"channels": 128, "steps": 3, "iterations": 12_500}
 """Size in the paper, and the number of iterations of 32 samples."""
 
 HELD_OUT = {"channels": 32}
-"""Rows that check how well a law that was fitted without them extrapolates."""
+"""Rows that show how well laws that were fitted without them extrapolate."""
 
 LEAST_CHANNELS = 8
-"""Smaller networks do not count for the law: with 4 channels, it misses the size held out."""
+"""Smaller networks do not count for the laws: with 4 channels, they miss the size held out."""
 
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class Law:
-    """log e = coefficients · (1, log channels, log iterations, steps), by least squares.
+    """e = floor + exp(c · (1, log channels, log iterations, steps)), by least squares of log e.
 
     Attributes
     ----------
-    coefficients : (4,) float64
-    inverse : (4, 4) float64
-        Inverse of the normal matrix.
+    coefficients : (4,) or (5,) float64
+        c and, for a law with a floor, its logarithm; e in m.
+    inverse : (n, n) float64
+        Inverse of the normal matrix of the linearised law.
     deviation : float
         Standard deviation of log e about the law.
-    freedom : int
-        Degrees of freedom: number of trainings minus number of coefficients.
+    n : int
+        Number of trainings.
     """
 
     coefficients: NDArray[np.float64]
     inverse: NDArray[np.float64]
     deviation: float
-    freedom: int
+    n: int
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom: number of trainings minus number of coefficients."""
+        return self.n - len(self.coefficients)
+
+    @property
+    def aicc(self) -> float:
+        """Akaike's information criterion for few data (Hurvich & Tsai 1989): less is better."""
+        k, squares = len(self.coefficients) + 1, self.freedom * self.deviation**2
+        return float(self.n * np.log(squares / self.n) + 2 * k + 2 * k * (k + 1) / (self.n - k - 1))
 
     def predict(self, row: dict[str, Any]) -> tuple[float, float, float]:
         """Return e of a new training in m, and the ends of its prediction interval."""
-        x = features([row])[0]
-        middle = float(x @ self.coefficients)
-        spread = self.deviation * float(np.sqrt(1.0 + x @ self.inverse @ x))
-        reach = float(student.ppf(0.5 + CONFIDENCE / 2.0, self.freedom)) * spread
+        x = features([row])
+        middle, slope = _log_e(self.coefficients, x)[0], _slopes(self.coefficients, x)[0]
+        reach = self._reach * float(np.sqrt(1.0 + slope @ self.inverse @ slope))
         low, mean, high = np.exp([middle - reach, middle, middle + reach])
         return float(mean), float(low), float(high)
 
     def interval(self, which: int) -> tuple[float, float]:
         """Return the confidence interval of a coefficient."""
-        reach = float(student.ppf(0.5 + CONFIDENCE / 2.0, self.freedom)) * self.deviation
-        reach *= float(np.sqrt(self.inverse[which, which]))
-        return float(self.coefficients[which]) - reach, float(self.coefficients[which]) + reach
+        middle = float(self.coefficients[which])
+        reach = self._reach * float(np.sqrt(self.inverse[which, which]))
+        return middle - reach, middle + reach
+
+    @property
+    def _reach(self) -> float:
+        return float(student.ppf(0.5 + CONFIDENCE / 2.0, self.freedom)) * self.deviation
 
 
 def features(rows: Sequence[dict[str, Any]]) -> NDArray[np.float64]:
@@ -88,15 +104,39 @@ def features(rows: Sequence[dict[str, Any]]) -> NDArray[np.float64]:
     )
 
 
-def fit_law(rows: Sequence[dict[str, Any]]) -> Law:
-    """Fit the law to the errors e of test samples, for networks that are large enough."""
+def _log_e(coefficients: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    power = x @ coefficients[:4]
+    return power if len(coefficients) == 4 else np.logaddexp(power, coefficients[4])
+
+
+def _slopes(coefficients: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the derivatives of log e by the coefficients, (n_rows, n_coefficients)."""
+    if len(coefficients) == 4:
+        return x
+    share = np.exp(x @ coefficients[:4] - _log_e(coefficients, x))[:, None]
+    return np.hstack([share * x, 1.0 - share])
+
+
+def fit_law(rows: Sequence[dict[str, Any]], *, floor: bool) -> Law:
+    """Fit a law to the errors e of test samples, for networks that are large enough."""
     rows = [row for row in rows if row["channels"] >= LEAST_CHANNELS]
     x, y = features(rows), np.log([row["test"]["mean_dof_m"] for row in rows])
-    coefficients: Any = np.linalg.lstsq(x, y, rcond=None)[0]
-    inverse: Any = np.linalg.pinv(x.T @ x)
-    freedom = len(rows) - int(np.linalg.matrix_rank(x))
-    deviation = float(np.sqrt(((y - x @ coefficients) ** 2).sum() / freedom))
-    return Law(coefficients, inverse, deviation, freedom)
+    found: Any = np.linalg.lstsq(x, y, rcond=None)[0]
+    if floor:
+        starts = [np.append(found, y.min() + below) for below in (-2.0, -1.0, -0.3)]
+
+        def error(c: NDArray[np.float64]) -> NDArray[np.float64]:
+            return _log_e(c, x) - y
+
+        def slope(c: NDArray[np.float64]) -> NDArray[np.float64]:
+            return _slopes(c, x)
+
+        fits = [least_squares(error, start, slope) for start in starts]
+        found = min(fits, key=lambda fit: float(fit.cost)).x
+    slopes = _slopes(found, x)
+    inverse: Any = np.linalg.pinv(slopes.T @ slopes)
+    squares = float(((y - _log_e(found, x)) ** 2).sum())
+    return Law(found, inverse, float(np.sqrt(squares / (len(rows) - len(found)))), len(rows))
 
 
 def trained(data: Dataset, channels: int, steps: int, iterations: int) -> dict[str, Any]:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import exp
+from typing import Any
 
 from mor_bench.report.number_format import number
 from mor_bench.report.published_figures import PUBLISHED
 from tests.benchmarks.umesh_scaling import HELD_OUT, PAPER, fit_law
 from tests.published.run_tables import markdown
 from tests.published.stored import content_of
+
+Rows = list[dict[str, Any]]
 
 PAPER_E_M = next(
     row.mean_m
@@ -50,30 +53,39 @@ def network_sizes(source: str) -> str:
 
 
 def network_size_law(source: str) -> str:
-    """Show the scaling law, how well it extrapolates, and what it says of the paper's size."""
+    """Show two scaling laws, how well they extrapolate, and what they say of the paper's size."""
     rows = content_of(source)["rows"]
-    law = fit_law(rows)
-    body = [
-        [f"exponent of the {name}", f"{law.coefficients[i]:.2f}", _pair(law.interval(i), _ratio)]
-        for i, name in ((1, "channels"), (2, "iterations"))
-    ]
-    low, high = law.interval(3)
-    further = _pair((exp(low), exp(high)), _ratio)
-    body.append(["factor of a further step", _ratio(exp(law.coefficients[3])), further])
     held_out = [row for row in rows if HELD_OUT.items() <= row.items()]
-    without = fit_law([row for row in rows if row not in held_out])
+    others = [row for row in rows if row not in held_out]
+    columns = [_law_cells(rows, others, held_out, floor=floor) for floor in (False, True)]
+    names = ["exponent of the channels", "exponent of the iterations", "factor of a further step"]
+    names += ["floor, m", "standard deviation of log e", "AICc (less is better)"]
     for row in held_out:
-        e, *ends = without.predict(row)
-        found = row["test"]["mean_dof_m"]
-        inside = "inside" if ends[0] <= found <= ends[1] else "outside"
+        measured = _metres(row["test"]["mean_dof_m"])
         name = f"e at {row['channels']} channels, {row['iterations']:,} iterations, m"
-        name += f", from the other sizes; measured {_metres(found)}: {inside}"
-        body.append([name, _metres(e), _pair(ends, _metres)])
-    e, *ends = law.predict(PAPER)
+        names.append(f"{name}, from the other sizes; measured {measured}")
     name = f"e at {PAPER['channels']} channels, {PAPER['steps']} steps, as many samples as in the "
-    name += f"paper, m, extrapolated; in the paper {_metres(PAPER_E_M)}"
-    body.append([name, _metres(e), _pair(ends, _metres)])
-    return markdown(["", "value", "95 % interval"], body)
+    names.append(name + f"paper, m, extrapolated; in the paper {_metres(PAPER_E_M)}")
+    body = [list(cells) for cells in zip(names, *columns, strict=True)]
+    return markdown(["", "power law", "power law above a floor"], body)
+
+
+def _law_cells(rows: Rows, others: Rows, held_out: Rows, *, floor: bool) -> list[str]:
+    """Return the cells of one law: all rows fit it, and the others alone for those held out."""
+    law, without = fit_law(rows, floor=floor), fit_law(others, floor=floor)
+    c = law.coefficients
+    cells = [f"{_ratio(c[i])} ({_pair(law.interval(i), _ratio)})" for i in (1, 2)]
+    for i, text in ((3, _ratio), (4, _metres)):
+        if i < len(c):
+            low, high = map(exp, law.interval(i))
+            cells.append(f"{text(exp(c[i]))} ({_pair((low, high), text)})")
+        else:
+            cells.append("–")
+    cells += [_ratio(law.deviation), f"{law.aicc:.0f}"]
+    for known, row in [*((without, row) for row in held_out), (law, PAPER)]:
+        e, *ends = known.predict(row)
+        cells.append(f"{_metres(e)} ({_pair(ends, _metres)})")
+    return cells
 
 
 def _ratio(value: float) -> str:
