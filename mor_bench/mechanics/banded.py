@@ -215,6 +215,13 @@ class BandedCholesky:
     """LAPACK's banded Cholesky, in natural or reverse Cuthill-McKee order.
 
     The order with the smaller band is taken.
+
+    Attributes
+    ----------
+    place : (n_nodes,) int64
+        Position of each node in the order.
+    bandwidth : int
+        Largest distance of two linked unknowns.
     """
 
     def __init__(self, pattern: Pattern) -> None:
@@ -224,6 +231,7 @@ class BandedCholesky:
         place[order] = np.arange(len(order))
         a, b = graph.nonzero()
         natural, reordered = int(np.abs(a - b).max()), int(np.abs(place[a] - place[b]).max())
+        self.place = place if reordered < natural else np.arange(len(order))
         self.bandwidth = 3 * min(natural, reordered) + 2
         self._order = dofs_of_nodes(order) if reordered < natural else None
         self._place = dofs_of_nodes(place) if reordered < natural else None
@@ -233,6 +241,11 @@ class BandedCholesky:
     def entries(self) -> int:
         """Number of stored entries of the band."""
         return self._pattern.whole.n * (self.bandwidth + 1)
+
+    @property
+    def node_entries(self) -> int:
+        """Number of stored entries of the band of a matrix with one unknown per node."""
+        return len(self.place) * (self.bandwidth // 3 + 1)
 
     def factor(self, values: NDArray[np.float64]) -> BandedFactor:
         whole = self._pattern.whole

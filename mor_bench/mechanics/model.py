@@ -72,8 +72,6 @@ MAX_BAND_ENTRIES = 5e7
 
 PCG_FROM = 3000
 """Number of unknowns above which conjugate gradients beat a banded factor per Newton step."""
-WARP_FROM = 10_000
-"""Number of unknowns from which large responses are bent; smaller meshes keep all digits."""
 JACOBI_ITERATIONS = 20_000
 CERTIFY_TOLERANCE = 1e-2
 REST_TOLERANCE = 1e-12
@@ -212,16 +210,20 @@ class FullOrderModel:
     def _direct_solver(self) -> LinearSolver:
         pattern = self.assembler.pattern
         if self.solver == "cholesky":
-            return BandedCholesky(pattern)
+            return self._narrow
         if self.solver == "superlu":
             return SparseLU(pattern)
         if self.solver == "pardiso":
             return Pardiso(pattern)
-        banded = BandedCholesky(pattern)
-        if banded.entries <= MAX_BAND_ENTRIES:
-            return banded
+        if self._narrow.entries <= MAX_BAND_ENTRIES:
+            return self._narrow
         points = self.scene.mesh.points[self.moving_nodes]
         return Multigrid(pattern, points, self.moving_frames)
+
+    @cached_property
+    def _narrow(self) -> BandedCholesky:
+        """Factorises in an order of the unknowns with a narrow band."""
+        return BandedCholesky(self.assembler.pattern)
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:
@@ -283,11 +285,9 @@ class FullOrderModel:
         """An approximate inverse of all tangents, R K₀⁻¹ Rᵀ; needs a banded or multigrid factor."""
         factor, pattern, warp = self.rest_factor, self.assembler.pattern, None
         assert isinstance(factor, BandedFactor | MultigridFactor)
-        single, cells = factor.single_precision(), self.turning_cells
-        banded = isinstance(factor, BandedFactor) and self.moving_frames is None
-        if self.n_unknowns >= WARP_FROM and banded:
-            place = single.place[::3] // 3
-            warp = warp_of(self._points, self.scene.mesh.cells, cells, pattern, place)
+        single, cells, narrow = factor.single_precision(), self.turning_cells, self._narrow
+        if self.moving_frames is None and narrow.node_entries <= MAX_BAND_ENTRIES:
+            warp = warp_of(self._points, self.scene.mesh.cells, cells, pattern, narrow.place)
         return RotatedRest(single, pattern, cells, self.moving_frames, warp)
 
     @property

@@ -81,10 +81,8 @@ def bendable() -> Scene:
 
 @pytest.fixture(scope="module")
 def bending() -> FullOrderModel:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mor_bench.mechanics.model.WARP_FROM", 0)
-        model = FullOrderModel(bendable())
-        model.prepare()
+    model = FullOrderModel(bendable())
+    model.prepare()
     return model
 
 
@@ -123,7 +121,6 @@ def test_every_law_and_element_ends_at_the_same_answer_from_a_bent_start(
     scene = scene_of(law, kind)
     load = patch_load(scene, -1, [0.5, -1.0, 3.0])
     plain = FullOrderModel(scene).solve(load, options=NewtonOptions(1e-10))
-    monkeypatch.setattr("mor_bench.mechanics.model.WARP_FROM", 0)
     monkeypatch.setattr("mor_bench.mechanics.accelerated.STRETCHED", 0.0)
     bent = FullOrderModel(scene).solve(load, options=NewtonOptions(1e-10))
     size = np.abs(plain.displacement).max()
@@ -132,7 +129,6 @@ def test_every_law_and_element_ends_at_the_same_answer_from_a_bent_start(
 
 def test_no_unstable_column_is_accepted_from_a_bent_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """Euler's load is about 1 N; a straight column beyond it is unstable."""
-    monkeypatch.setattr("mor_bench.mechanics.model.WARP_FROM", 0)
     monkeypatch.setattr("mor_bench.mechanics.accelerated.STRETCHED", 0.0)
     spec = mor_bench.load_scene("beam-coarse").spec.model_dump(mode="json")
     spec["geometry"] = {"shape": "box", "size_m": [10.0, 1.0, 1.0], "cells": [20, 2, 2]}
