@@ -38,6 +38,8 @@ LEAST_RANDOMISED_TOLERANCE = 1e-6
 """Least energy tolerance of a randomised decomposition; round-off hides smaller shares."""
 SEED = 0
 EPS = float(np.finfo(np.float64).eps)
+SOLVED = 1e-8
+"""Relative error of displacements that the full-order model solved for, by its default."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,32 @@ def pod(
             _remembered.keep(key, found, reach)
     found.precision = max(precision, EPS)
     return found.truncated(n_modes, energy_tolerance)
+
+
+def accurate_modes(displacements: NDArray[np.float64], n_modes: int) -> NDArray[np.float64]:
+    """Return the leading modes (n, r) of solved displacements, without those of the solver's error.
+
+    A cubature would be trained on that error, and leave such modes almost without stiffness.
+
+    Parameters
+    ----------
+    displacements : (n_samples, n) float64
+        Displacements, m, with a relative error of at most `SOLVED`.
+    n_modes : int
+        Capped with a warning.
+    """
+    basis = pod(displacements, n_modes)
+    sizes = basis.singular_values[: basis.modes.shape[1]]
+    kept = int((sizes > SOLVED * sizes[0]).sum())
+    if kept < len(sizes):
+        warnings.warn(
+            f"{n_modes} modes were requested, but the samples determine {kept}: the others hold "
+            f"less than {SOLVED:g} of the displacements, which is the error of the solver. "
+            f"{kept} modes are used.",
+            RankDeficientWarning,
+            stacklevel=2,
+        )
+    return np.ascontiguousarray(basis.modes[:, :kept])
 
 
 def _decomposed(

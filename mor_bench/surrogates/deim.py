@@ -14,7 +14,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.model_arrays import take_array, take_indices
-from mor_bench.reduction.basis import pod
+from mor_bench.reduction.basis import accurate_modes, pod
 from mor_bench.reduction.discrete_interpolation import Selection, interpolation_rows
 from mor_bench.reduction.galerkin import stiffness_times
 from mor_bench.reduction.petrov import InterpolatedProblem
@@ -95,7 +95,7 @@ class InterpolatedPOD(Surrogate):
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         displacements = samples.free_displacements
-        modes = pod(displacements, self.value("n_modes")).modes
+        modes = accurate_modes(displacements, self.value("n_modes"))
         model = FullOrderModel(scene)
         stiff = stiffness_times(model.assembler.pattern, model.rest_tangent, modes)
         q = self._coordinates(scene, samples, modes)

@@ -16,7 +16,7 @@ from mor_bench.mechanics.model import body_of, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.mechanics.parametric import Bodies
 from mor_bench.model_arrays import take_array, take_indices
-from mor_bench.reduction.basis import pod
+from mor_bench.reduction.basis import accurate_modes
 from mor_bench.reduction.galerkin import CubatureProblem
 from mor_bench.reduction.points import ReducedPoints
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto
@@ -66,8 +66,8 @@ class CubatureSurrogate(Surrogate):
     Parameters
     ----------
     n_modes : int or "auto"
-        Size r of the basis; capped at the snapshots' rank with a warning. "auto", also for the
-        tolerances: the cheapest values that meet the scene's need, see
+        Size r of the basis; capped at the modes that the snapshots determine, with a warning.
+        "auto", also for the tolerances: the cheapest values that meet the scene's need, see
         `mor_bench.reduction.sizing`.
     cubature_tolerance : float or "auto"
         Allowed error of the cubature, in [0, 1). A smaller value keeps more cells: slower, and
@@ -110,7 +110,7 @@ class CubatureSurrogate(Surrogate):
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         displacements, tolerance = samples.free_displacements, self.value("cubature_tolerance")
-        modes = pod(displacements, self.value("n_modes")).modes
+        modes = accurate_modes(displacements, self.value("n_modes"))
         if tolerance == 0:
             cells, weights = np.arange(scene.mesh.n_cells), np.ones(scene.mesh.n_cells)
         else:
