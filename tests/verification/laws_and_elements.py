@@ -15,6 +15,7 @@ from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.banded import BandedCholesky
 from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.mechanics.elements import T4, shape_gradients
+from mor_bench.mechanics.laws import LANES, point_stresses
 from mor_bench.scene.interpolation import quadratic, trilinear
 from mor_bench.scene.materials import (
     Corotational,
@@ -167,6 +168,21 @@ def piola(law: Material, gradient: Array) -> Array:
         powers = sum(mu * bar**alpha for mu, alpha in zip(law.mu_pa, law.alpha, strict=True))
         tau = deviator(np.einsum("...ia,...a,...ja->...ij", vectors, powers, vectors))
     return np.asarray((tau + law.bulk_pa * (j - 1) * j * eye) @ inverse)
+
+
+def at_points(law: Material, gradients: Array) -> tuple[Array, Array, float, float]:
+    """Return P (n, 3, 3), dP/dF (n, 3, 3, 3, 3), energy and least det F; H = du/dX (n, 3, 3)."""
+    n = len(gradients)
+    padded = np.zeros((LANES, 9))
+    padded[:n] = gradients.reshape(n, 9)
+    weights = (np.arange(LANES) < n).astype(float)[None]
+    parameters = np.repeat(law.parameters, LANES)[None]
+    stress, slope = np.empty((1, 9 * LANES)), np.empty((1, 81 * LANES))
+    energy, least = point_stresses(law.law)(
+        np.ascontiguousarray(padded.T).reshape(1, -1), weights, parameters, stress, slope
+    )
+    P, A = stress.reshape(9, LANES).T[:n], slope.reshape(81, LANES).T[:n]
+    return P.reshape(n, 3, 3), A.reshape(n, 3, 3, 3, 3), energy, least
 
 
 AMPLITUDE = 0.05 * np.array([1.0, -1.0, 0.5])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mor_bench.mechanics.laws import LANES, point_stresses
 from mor_bench.scene.materials import (
     Corotational,
     HolzapfelGasserOgden,
@@ -20,6 +19,8 @@ from mor_bench.scene.materials import (
     Yeoh,
 )
 
+from .laws_and_elements import at_points
+
 Array = NDArray[np.float64]
 
 OGDEN = Ogden((100.0, -20.0), (2.5, -2.0), 800.0)
@@ -29,21 +30,6 @@ FIBRES = HolzapfelGasserOgden(80.0, 90.0, 1.2, 0.1, ((1.0, 2.0, 0.0), (0.0, -1.0
 
 LAWS = [NeoHookean(500.0, 0.4), MooneyRivlin(60.0, 20.0, 800.0), OGDEN, YEOH, FIBRES]
 EVERY = [*LAWS, Corotational(500.0, 0.4)]
-
-
-def at_points(law: Material, gradients: Array) -> tuple[Array, Array, float, float]:
-    """Return P (n, 3, 3), dP/dF (n, 3, 3, 3, 3), energy and least det F; H = du/dX (n, 3, 3)."""
-    n = len(gradients)
-    padded = np.zeros((LANES, 9))
-    padded[:n] = gradients.reshape(n, 9)
-    weights = (np.arange(LANES) < n).astype(float)[None]
-    parameters = np.repeat(law.parameters, LANES)[None]
-    stress, slope = np.empty((1, 9 * LANES)), np.empty((1, 81 * LANES))
-    energy, least = point_stresses(law.law)(
-        np.ascontiguousarray(padded.T).reshape(1, -1), weights, parameters, stress, slope
-    )
-    P, A = stress.reshape(9, LANES).T[:n], slope.reshape(81, LANES).T[:n]
-    return P.reshape(n, 3, 3), A.reshape(n, 3, 3, 3, 3), energy, least
 
 
 def shear_moduli(law: Ogden, gaps: list[Decimal], stretch: Decimal) -> tuple[float, float]:
