@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 import mor_bench
+from mor_bench.counting import counted
 from mor_bench.errors import InvalidInputError, SpecError, StoreError
-from mor_bench.mechanics.compliance import project
+from mor_bench.mechanics.compliance import Compliance, project
+from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.surrogates import pca_regression
@@ -281,3 +284,31 @@ def test_more_monomials_than_fit_into_memory_are_refused(
         mor_bench.load_method("pca-regression-linear", n_input_modes=11, degree=2).fit(
             tiny.scene, train
         )
+
+
+@pytest.mark.parametrize("name", ["pca-regression", "pca-regression-linear", "pca-kernel-ridge"])
+def test_a_query_for_few_outputs_costs_less_and_gives_the_same(tiny: Dataset, name: str) -> None:
+    """Wanted displacements are those of a query for all; the others are NaN."""
+    needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max"})
+    few = replace(tiny.scene, spec=tiny.scene.spec.model_copy(update={"needs": needs}))
+    nodes, forces = few.output_nodes, tiny.test.forces[:20]
+    answers, work = [], []
+    for scene in (tiny.scene, few):
+        method = mor_bench.load_method(name).fit(scene, tiny.train)
+        with counted() as found:
+            answers.append(method.predict(forces))
+        work.append(found.multiply_adds)
+    np.testing.assert_allclose(answers[1][:, nodes], answers[0][:, nodes], rtol=0, atol=1e-14)
+    assert np.isnan(np.delete(answers[1], nodes, axis=1)).all()
+    assert work[1] < work[0]
+
+
+def test_loads_elsewhere_are_answered_for_few_outputs_too(tiny: Dataset) -> None:
+    """A load on nodes without kept columns takes a back-solve."""
+    compliance = Compliance(FullOrderModel(tiny.scene))
+    loads = np.random.default_rng(0).normal(size=(2, tiny.scene.mesh.n_dofs))
+    loads[1] = tiny.test.forces[0].ravel()
+    dofs = np.array([5, 100, 150])
+    found = compliance.at(dofs)(loads)
+    size = np.abs(found).max()
+    np.testing.assert_allclose(found, compliance.respond(loads)[:, dofs], 0, 1e-12 * size)

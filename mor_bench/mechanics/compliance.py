@@ -6,6 +6,8 @@ than a back-solve with both triangles of a factor.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -26,7 +28,7 @@ _FIXED, _ELSEWHERE = -1, -2
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _respond(columns, place, most, loads, out, used):
-    """Sum columns (n_kept, n_dofs) for each of the loads (n, n_dofs).
+    """Sum columns (n_kept, m) for each of the loads (n, n_dofs); write them to out (n, m).
 
     ``used`` (n,) receives the number of columns, or -1 if the load needs a back-solve.
     """
@@ -150,14 +152,35 @@ class Compliance:
             return frames.to_global(self._respond(frames.to_local(loads)))
         return self._respond(loads)
 
-    def _respond(self, loads: Array) -> Array:
-        """Return responses in the frames of the nodes, as the loads are."""
+    def at(self, dofs: NDArray[np.int64]) -> Callable[[Array], Array]:
+        """Return a function of loads (n, n_dofs), N, that gives `respond` at some dofs only, m."""
+        if self._scene.frames is not None or not len(self.columns):
+            return lambda loads: self.respond(loads)[:, dofs]
+        columns = np.ascontiguousarray(self.columns[:, dofs])
+
+        def respond(loads: Array) -> Array:
+            out, others = self._summed(columns, loads)
+            if others.any():
+                out[others] = self.respond(loads[others])[:, dofs]
+            return out
+
+        return respond
+
+    def _summed(self, columns: Array, loads: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return sums of columns (n_kept, m), and which loads need a back-solve instead."""
         loads = np.ascontiguousarray(loads)  # the kernel is compiled once per memory order
-        out, used = np.empty(loads.shape), np.empty(len(loads), dtype=np.int64)
-        _respond(self.columns, self._place, self._most, loads, out, used)
+        out = np.empty((len(loads), columns.shape[1]))
+        used = np.empty(len(loads), dtype=np.int64)
+        _respond(columns, self._place, self._most, loads, out, used)
         others = used < 0
         if is_counting():
-            count(multiply_adds=int(used[~others].sum()) * len(self._free))
+            moving = min(columns.shape[1], len(self._free))
+            count(multiply_adds=int(used[~others].sum()) * moving)
+        return out, others
+
+    def _respond(self, loads: Array) -> Array:
+        """Return responses in the frames of the nodes, as the loads are."""
+        out, others = self._summed(self.columns, loads)
         if others.any():
             rows = np.flatnonzero(others)
             out[rows[:, None], self._free] = self._factor.solve(

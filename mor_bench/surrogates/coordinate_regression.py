@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.compliance import project
+from mor_bench.mechanics.compliance import Compliance, project
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.observed import LinearResponse, linear_response
 from mor_bench.mechanics.parametric import Bodies, ParametricResponse
@@ -21,6 +21,7 @@ from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import error_weights, input_axes
 from mor_bench.reduction.sensitivity import sensitivities
+from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.given import ObservedDisplacements
@@ -204,18 +205,37 @@ class CoordinateRegression(Surrogate, ABC):
             self._respond_to(scene)
         if self.input == "force" or not scene.parameter_names:
             self.from_forces_ = self._to_coordinates(self.axes_)
-        self._expanding = np.ascontiguousarray(scene.columns_at_all_dofs(self.modes_).T)
+        expanding, nodes = scene.columns_at_all_dofs(self.modes_), scene.output_nodes
+        self._wanted: NDArray[np.int64] | None = None
+        self._respond_at: Callable[[Array], Array] | None = None
+        if len(nodes) < scene.mesh.n_nodes and not scene.parameter_names:
+            self._wanted = dofs_of_nodes(nodes)
+            expanding = expanding[self._wanted]
+            if self._adds_response and isinstance(self.response_, Compliance):
+                self._respond_at = self.response_.at(self._wanted)
+        self._expanding = np.ascontiguousarray(expanding.T)
 
     def answer(self, forces: Array) -> Array:
-        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
+        loads, wanted = forces.reshape(-1, self.scene_.mesh.n_dofs), self._wanted
         if self._kinked:
             loads = self.response_.respond(loads)
         coefficients = self.coefficients(project(self.from_forces_, loads))
-        count(multiply_adds=len(loads) * self.modes_.size)
+        count(multiply_adds=len(loads) * min(self._expanding.size, self.modes_.size))
         out = coefficients @ self._expanding
         if self._adds_response:
-            out += loads if self._kinked else self.response_.respond(loads)
+            out += self._added(loads)
+        if wanted is not None:
+            whole = np.full(loads.shape, np.nan)
+            whole[:, wanted] = out
+            out = whole
         return out.reshape(forces.shape)
+
+    def _added(self, loads: Array) -> Array:
+        """Return the linear response at the wanted dofs; ``loads`` is it where it is kinked."""
+        if self._respond_at is not None:
+            return self._respond_at(loads)
+        response = loads if self._kinked else self.response_.respond(loads)
+        return response if self._wanted is None else response[:, self._wanted]
 
     def answer_parametric(self, forces: Array, parameters: Array) -> Array:
         loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
