@@ -7,7 +7,7 @@ import json
 from math import prod
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.specs.base import Name, Positive, StrictModel, Text
@@ -35,6 +35,9 @@ MAX_NODES = 1_000_000
 NO_EQUATIONS = "its snapshots were imported, so its equations are not known"
 NO_FORCES = "its forces are not known, only the displacements of a part of its surface"
 CONTACT = "an instrument presses it, and the method needs given forces"
+
+FIXED_REGIONS = (Motion, Pressure, Contact, Several)
+"""Plans whose samples all act on the same regions."""
 
 Side = Annotated[int, Field(ge=2, le=1024)]
 
@@ -151,13 +154,21 @@ class DatasetSpec(CommonDatasetSpec):
     parameters: SampledParameters | None = Field(
         default=None, exclude_if=lambda value: value is None
     )
-    split: Split = Split()
+    split: Annotated[Split, Field(validate_default=True)] = Split()
     tests: ExtraTests = ExtraTests()
+
+    @field_validator("split")
+    @classmethod
+    def _suits_loads(cls, split: Split, info: ValidationInfo) -> Split:
+        """Split by sample where all samples act on the same regions, unless the file says more."""
+        if isinstance(info.data.get("loads"), FIXED_REGIONS) and "by" not in split.model_fields_set:
+            return split.model_copy(update={"by": "sample"})
+        return split
 
     @model_validator(mode="after")
     def _fixed_regions(self) -> Self:
         """Check what a plan excludes whose samples do not act on one region each."""
-        if not isinstance(self.loads, Motion | Pressure | Contact | Several):
+        if not isinstance(self.loads, FIXED_REGIONS):
             return self
         where = f"where `loads.kind` is {self.loads.kind!r}"
         why = "all samples act on the same regions"

@@ -17,7 +17,13 @@ OUTSIDE, MAX_OUTSIDE = 1.5, 10.0
 
 
 class Split(StrictModel):
-    """Choice of the validation and test samples; see `mor_bench.snapshots.split`."""
+    """Choice of the validation and test samples; see `mor_bench.snapshots.split`.
+
+    Attributes
+    ----------
+    by : str
+        Default: `region`; where all samples act on the same regions, `sample`.
+    """
 
     test_fraction: Fraction = 0.2
     validation_fraction: Fraction = 0.15

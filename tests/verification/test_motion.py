@@ -140,7 +140,6 @@ def test_reaction_errors_compare_resultants() -> None:
     ("changed", "message"),
     [
         ({"split": {"by": "region"}}, "`split.by` must be 'sample' or 'direction'"),
-        ({"split": {}}, "`split.by` must be 'sample' or 'direction'"),
         ({"observed": {"region": "z-max"}}, "`observed` must be absent"),
         ({"tests": {"unseen_region": "z-max"}}, "`tests.unseen_region` must be absent"),
         ({"tests": {"paper_magnitude_n": [0, 1]}}, "`tests.paper_magnitude_n` must be absent"),

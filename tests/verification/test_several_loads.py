@@ -19,7 +19,7 @@ from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.snapshots.test_sets import available_sets, spec_of_set
-from mor_bench.specs import tables_of
+from mor_bench.specs import DatasetSpec, tables_of
 
 from .oblique import solved
 from .test_points_and_lines import LINE, POINT, content
@@ -196,5 +196,6 @@ def test_wrong_tables_are_refused(tables: list[dict[str, Any]], message: str) ->
 
 
 def test_several_tables_are_split_by_sample() -> None:
+    assert DatasetSpec.model_validate(content(loads=TABLES)).split.by == "sample"
     with pytest.raises(SpecError, match=r"`split.by` must be 'sample' with several tables"):
         together(PRESSURE, FORCE, split={"by": "region"})
