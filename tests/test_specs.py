@@ -210,10 +210,13 @@ def test_a_body_alone_can_be_solved_as_in_its_dataset(tmp_path: Path) -> None:
     forces[-1, 2] = 0.3
     of_dataset = mor_bench.load_scene("beam-tiny")
     answers = [
-        mor_bench.load_method("fem").fit(scene).predict(forces) for scene in (alone, of_dataset)
+        mor_bench.load_method(name).fit(scene).predict(forces)
+        for name in ("fem", "linear-fem")
+        for scene in (alone, of_dataset)
     ]
     assert np.abs(answers[0]).max() > 0.02
     np.testing.assert_array_equal(answers[0], answers[1])
+    np.testing.assert_allclose(answers[2], answers[3], atol=1e-15)
     for load in (mor_bench.load_dataset, lambda body: mor_bench.run([body], ["fem"], out=tmp_path)):
         with pytest.raises(SpecError, match="`loads` is missing, so no samples can be drawn"):
             load(BODY)

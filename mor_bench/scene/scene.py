@@ -306,8 +306,10 @@ class Scene:
         They are the consistent load of a uniform traction. An embedded surface passes it to the
         nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes, and for an
         instrument at each node that it may touch. For a pressure they are components of area
-        vectors, m².
+        vectors, m². Without a table `loads` there is no patch.
         """
+        if self.generated.loads is None:
+            return sp.csr_array((0, self.mesh.n_nodes))
         if self.contact:
             touched = np.zeros((1, self.mesh.n_nodes))
             touched[:, self.observed_nodes] = 1.0
