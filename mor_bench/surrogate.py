@@ -33,6 +33,7 @@ from mor_bench.snapshots.given import (
     checked_forces,
     checked_given,
     checked_parametric,
+    has_values,
 )
 from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.specs import CONTACT, NO_FORCES, check_parameters
@@ -208,7 +209,7 @@ class Surrogate:
             Nodal forces, N; or displacements of a part of the surface, m.
         parameters : (n_parameters,) or (n, n_parameters), optional
             Values of ``scene.parameter_names``, for all forces or for each of them. Required in a
-            scene with sampled parameters, and refused in all others.
+            scene with sampled parameters; all others accept only an array without columns.
 
         Returns
         -------
@@ -228,7 +229,7 @@ class Surrogate:
             given = self._checked(forces)
             assert isinstance(given, ObservedDisplacements)
             found, shape = self.answer_observed(given), given.values.shape
-        elif parameters is not None or self._fitted_scene().parameter_names:
+        elif has_values(parameters) or self._fitted_scene().parameter_names:
             both = checked_parametric(self._fitted_scene(), forces, parameters)
             found, shape = self.answer_parametric(both.values, both.parameters), both.values.shape
         else:
@@ -388,7 +389,7 @@ class Surrogate:
         self.scene_, self.sizes_, self.timings_ms_ = scene, sizes, {}
 
     def _checked(self, forces: ArrayLike, parameters: ArrayLike | None = None) -> Given:
-        if parameters is not None:
+        if has_values(parameters):
             return checked_parametric(self._fitted_scene(), forces, parameters)
         return checked_given(self._fitted_scene(), forces)
 

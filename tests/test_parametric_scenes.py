@@ -187,11 +187,15 @@ def test_wrong_parameters_of_a_query_give_one_clear_error(
             ask(data.test.forces[:4], parameters)
 
 
-def test_parameters_are_refused_in_a_scene_without_any() -> None:
+def test_a_scene_without_parameters_refuses_all_but_an_array_without_columns() -> None:
     scene = mor_bench.load_scene("beam-tiny")
     method = mor_bench.load_method("linear-fem").fit(scene)
     with pytest.raises(InvalidInputError, match="`parameters` must be absent"):
         method.predict(np.zeros((scene.mesh.n_nodes, 3)), [500.0])
+    forces = np.ones((2, scene.mesh.n_nodes, 3))
+    none = np.zeros((2, 0))  # as `Snapshots.parameters` of such a scene
+    np.testing.assert_array_equal(method.predict(forces, none), method.predict(forces))
+    np.testing.assert_array_equal(method.out_of_range(forces, none), [False, False])
 
 
 def test_the_error_indicator_says_that_it_knows_one_body_only(data: Dataset) -> None:

@@ -113,6 +113,14 @@ def given_of(
     return ObservedDisplacements(values, scene.observed_nodes)
 
 
+def has_values(parameters: ArrayLike | None) -> bool:
+    """Return whether parameters of bodies are given: an array without columns holds none."""
+    try:
+        return parameters is not None and np.shape(parameters)[-1:] != (0,)
+    except ValueError:  # rows of different lengths
+        return True
+
+
 def missing_parameters(scene: Scene) -> str:
     """Return the message for a query without the parameters that its scene needs."""
     n, names = len(scene.parameter_names), ", ".join(scene.parameter_names)
