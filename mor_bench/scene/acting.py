@@ -24,8 +24,10 @@ from mor_bench.scene.loads import (
 )
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.nearest import tree_of
+from mor_bench.scene.problems import Problems
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.specs import (
+    AnyLoads,
     AnyTable,
     Contact,
     LineLoads,
@@ -34,6 +36,7 @@ from mor_bench.specs import (
     PointLoads,
     Pressure,
     Region,
+    tables_of,
 )
 
 
@@ -66,39 +69,60 @@ class Ground:
 class Acting:
     """The patches of one table `[loads]`.
 
-    A patch is an area, a point, a line, one component of a pressed region, or a tool.
+    A patch is an area, a point, a line, one component of a pressed region, or a tool. The key is
+    that of the table in the file.
     """
 
     plan: AnyTable
     ground: Ground
+    key: str
 
-    def surface_points(self, region: Region) -> NDArray[np.int64]:
+    def _surface_points(self, region: Region, key: str) -> NDArray[np.int64]:
         """Return the sorted points of the surface in a region; `SpecError` if none."""
         surface = self.ground.surface
         on_surface = np.unique(surface.facets)
         sets = {} if self.ground.embedded else self.ground.point_sets
         cloud = Cloud(surface.points, on_surface, sets)
-        found = np.intersect1d(region_points(cloud, region), on_surface)
+        found = np.intersect1d(region_points(cloud, region, key), on_surface)
         if not len(found):
+            raise SpecError(f"`{key}` holds nodes inside the body only, none on its surface.")
+        if isinstance(self.plan, Pressure) and not len(surface.within(found)):
             raise SpecError(
-                "the load region holds nodes inside the body only, none on its surface."
+                f"`{key}` holds nodes but no facet of the surface, so no pressure can act on it."
             )
         return found
 
     @cached_property
-    def _loaded_points(self) -> NDArray[np.int64]:
-        plan = self.plan
+    def _regions(self) -> list[NDArray[np.int64]]:
+        """The points of the surface in each region; `SpecError` for all regions without any."""
+        plan, key, found = self.plan, self.key, []
         assert not isinstance(plan, LineLoads)
-        regions = plan.regions if isinstance(plan, Pressure) else (plan.region,)
-        return np.unique(np.concatenate([self.surface_points(region) for region in regions]))
+        keyed = (
+            {f"{key}.region": plan.region}
+            if not isinstance(plan, Pressure)
+            else {f"{key}.regions[{number}]": region for number, region in enumerate(plan.regions)}
+        )
+        with Problems() as problems:
+            if isinstance(plan, Pressure) and plan.follower and self.ground.embedded:
+                problems.found.append(
+                    "`loads.follower` must be false where loads act on a smooth surface that the "
+                    "mesh only contains."
+                )
+            for name, region in keyed.items():
+                with problems.keep():
+                    found.append(self._surface_points(region, name))
+        return found
+
+    @cached_property
+    def _loaded_points(self) -> NDArray[np.int64]:
+        return np.unique(np.concatenate(self._regions))
 
     @cached_property
     def nodes(self) -> NDArray[np.int64]:
         """(n_patches,) surface point at the centre of each patch, see `Scene.patch_nodes`."""
         plan, surface = self.plan, self.ground.surface
         if isinstance(plan, Pressure):
-            regions = [self.surface_points(region) for region in plan.regions]
-            middles = [surface.points[region].mean(axis=0) for region in regions]
+            middles = [surface.points[region].mean(axis=0) for region in self._regions]
             return np.repeat(np.concatenate([self.nearest(m) for m in middles]), 3)
         if isinstance(plan, Motion):
             assert self.ground.tool_nodes is not None
@@ -112,7 +136,9 @@ class Acting:
         if isinstance(plan, PointLoads) and not self.ground.embedded:
             region = np.setdiff1d(region, self.ground.fixed_nodes)
             if not len(region):
-                raise SpecError("the load region holds fixed nodes only, which no force can move.")
+                raise SpecError(
+                    f"`{self.key}.region` holds fixed nodes only, which no force can move."
+                )
         if plan.n_patches is None:
             return region
         points = surface.points[region]
@@ -147,8 +173,7 @@ class Acting:
     def pressed_facets(self) -> list[NDArray[np.int64]]:
         """The facets (n_facets, 4, 3 or 6) of each region of a pressure."""
         assert isinstance(self.plan, Pressure)
-        surface = self.ground.surface
-        return [surface.within(self.surface_points(r)) for r in self.plan.regions]
+        return [self.ground.surface.within(region) for region in self._regions]
 
     @cached_property
     def patches(self) -> Patches:
@@ -201,6 +226,24 @@ class Acting:
                 raise SpecError(f"`loads.lines` must lie in the body: {error}") from None
             return self._weights(sp.csr_array(shares @ at_nodes))
         return self._weights(sp.csr_array(self.patches.areas @ self.patches.values))
+
+
+def acting_on(ground: Ground, loads: AnyLoads) -> tuple[Acting, ...]:
+    """Return the loads of each table of a plan on a body."""
+    tables = tables_of(loads)
+    if len(tables) == 1:
+        return (Acting(tables[0], ground, "loads"),)
+    return tuple(Acting(table, ground, f"loads[{k}]") for k, table in enumerate(tables))
+
+
+def weights_of(acting: Sequence[Acting]) -> sp.csr_array:
+    """Return the nodal weights of all patches, see `Scene.patch_weights`."""
+    parts = []
+    with Problems() as problems:
+        for table in acting:
+            with problems.keep():
+                parts.append(table.weights)
+    return parts[0] if len(parts) == 1 else sp.csr_array(sp.vstack(parts))
 
 
 def points_of(

@@ -165,16 +165,7 @@ def pressed_patches(
         Whether the points serve meshes with divided facets too. Few points per facet give the
         consistent load of its own mesh, and forces at single nodes of a fine one.
 
-    Raises
-    ------
-    SpecError
-        If a region has no facet.
     """
-    if any(len(facets) == 0 for facets in regions):
-        raise SpecError(
-            "a region of `loads.regions` holds nodes but no facet of the surface, so no pressure "
-            "can act on it."
-        )
     if fine:
         rules = [
             _divided_rule(surface, facets, _fine_spacing(surface, facets)) for facets in regions

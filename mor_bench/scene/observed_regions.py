@@ -21,7 +21,7 @@ def observed_nodes(cloud: Cloud, observed: Observed, fixed_nodes: Nodes) -> Node
         If there is none, or the region contains every free node.
     """
     free = np.setdiff1d(np.arange(len(cloud.points)), fixed_nodes)
-    region = region_points(cloud, observed.region)
+    region = region_points(cloud, observed.region, "observed.region")
     seen = np.intersect1d(np.intersect1d(region, cloud.on_surface), free)
     if not len(seen):
         raise SpecError(
@@ -43,7 +43,8 @@ def moved_nodes(cloud: Cloud, motion: Motion, fixed_dofs: Nodes) -> Nodes:
     SpecError
         If there is none, if one of them is supported, or if no free node is left.
     """
-    moved = np.intersect1d(region_points(cloud, motion.region), cloud.on_surface)
+    region = region_points(cloud, motion.region, "loads.region")
+    moved = np.intersect1d(region, cloud.on_surface)
     if not len(moved):
         raise SpecError("`loads.region` holds no node of the surface, so no tool can move it.")
     supported, components = np.unique(fixed_dofs // 3, return_counts=True)

@@ -43,14 +43,21 @@ class Cloud:
     sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
 
-def region_points(cloud: Cloud, region: Region) -> NDArray[np.int64]:
-    """Return the sorted numbers of the points in a region.
+def region_points(cloud: Cloud, region: Region, key: str) -> NDArray[np.int64]:
+    """Return the sorted numbers of the points in a region, which a file gives under a key.
 
     Raises
     ------
     SpecError
         If the region holds no point, or names an unknown set.
     """
+    try:
+        return np.sort(_some_points(cloud, region))
+    except SpecError as error:
+        raise SpecError(f"`{key}`: {error}") from None
+
+
+def _some_points(cloud: Cloud, region: Region) -> NDArray[np.int64]:
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     near = ON_FACE * float(np.linalg.norm(high - low))
     if isinstance(region, PointSetRegion):
@@ -71,7 +78,7 @@ def region_points(cloud: Cloud, region: Region) -> NDArray[np.int64]:
             f"region {shown} holds no node of the mesh; the mesh extends from "
             f"{low.tolist()} to {high.tolist()} m."
         )
-    return np.sort(found)
+    return found
 
 
 def _inside(points: NDArray[np.float64], region: Region, near: float) -> NDArray[np.bool_]:

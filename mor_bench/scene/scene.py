@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
-from mor_bench.scene.acting import Acting, Ground, points_of
+from mor_bench.scene.acting import Acting, Ground, acting_on, points_of, weights_of
 from mor_bench.scene.body import build_body
 from mor_bench.scene.contact_surface import ContactSurface, contact_surface, touched_nodes
 from mor_bench.scene.dofs import dofs_of_nodes
@@ -22,11 +22,12 @@ from mor_bench.scene.loads import Facets
 from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.observed_regions import moved_nodes, observed_nodes
+from mor_bench.scene.problems import Problems
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.scene.second_order import in_elements
 from mor_bench.scene.snapshot_file import ImportedArrays, read_arrays
-from mor_bench.scene.springs import Springs, foundations
-from mor_bench.scene.supports import Frames, held_by
+from mor_bench.scene.springs import Springs, foundations, matrix_of
+from mor_bench.scene.supports import NOTHING_HELD, Frames, held_by
 from mor_bench.specs import (
     AnyDatasetSpec,
     Contact,
@@ -36,7 +37,6 @@ from mor_bench.specs import (
     Pressure,
     generated,
     load_dataset_spec,
-    tables_of,
 )
 
 
@@ -148,8 +148,7 @@ class Scene:
     @cached_property
     def spring_matrix(self) -> sp.csr_array | None:
         """(n_dofs, n_dofs) stiffness of the springs, N/m; None without springs."""
-        matrices = [springs.matrix(self.mesh) for springs in self.springs]
-        return sp.csr_array(sum(matrices[1:], matrices[0])) if matrices else None
+        return matrix_of(self.springs, self.mesh)
 
     @cached_property
     def _cloud(self) -> Cloud:
@@ -161,7 +160,7 @@ class Scene:
         outputs = self.spec.needs.outputs
         if outputs == "all":
             return np.arange(self.mesh.n_nodes)
-        return region_points(self._cloud, outputs)
+        return region_points(self._cloud, outputs, "needs.outputs")
 
     @cached_property
     def observed_nodes(self) -> NDArray[np.int64] | None:
@@ -237,7 +236,7 @@ class Scene:
             self.fixed_nodes,
             self.observed_nodes if self.motion else None,
         )
-        return tuple(Acting(table, ground) for table in tables_of(self.generated.load_plan))
+        return acting_on(ground, self.generated.load_plan)
 
     @property
     def pressed_facets(self) -> list[NDArray[np.int64]]:
@@ -314,25 +313,15 @@ class Scene:
             touched = np.zeros((1, self.mesh.n_nodes))
             touched[:, self.observed_nodes] = 1.0
             return sp.csr_array(touched)
-        parts = [acting.weights for acting in self.acting]
-        return parts[0] if len(parts) == 1 else sp.csr_array(sp.vstack(parts))
+        return weights_of(self.acting)
 
     def prepare(self) -> Scene:
         """Find all regions now, so empty regions raise one `SpecError` here; return the scene."""
-        sampled = isinstance(self.spec, DatasetSpec) and self.spec.loads is not None
-        problems = []
-        if self.follows and self.embedded_surface:
-            problems.append(
-                "`loads.follower` must be false where loads act on a smooth surface that the mesh "
-                "only contains."
-            )
-        for name in (*(("patch_weights",) if sampled else ()), "output_nodes", "observed_nodes"):
-            try:
-                getattr(self, name)
-            except SpecError as problem:
-                problems.append(str(problem))
-        if problems:
-            raise SpecError(" ".join(dict.fromkeys(problems)))
+        loaded = ("patch_weights",) if isinstance(self.spec, DatasetSpec) else ()
+        with Problems() as problems:
+            for name in (*loaded, "output_nodes", "observed_nodes"):
+                with problems.keep():
+                    getattr(self, name)
         return self
 
 
@@ -365,7 +354,11 @@ def load_scene(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> Scene
     spec = as_spec(source)
     try:
         if isinstance(spec, DatasetSpec):
-            return scene_without_patches(spec).prepare()
+            with Problems() as problems:
+                scene = _with_supports(spec, problems)
+                with problems.keep():
+                    scene.prepare()
+            return scene
         return imported_scene(spec, read_arrays(spec.snapshots.file))
     except SpecError as error:
         raise SpecError(f"{spec.name}: {error}") from None
@@ -378,15 +371,26 @@ def imported_scene(spec: ImportedDatasetSpec, arrays: ImportedArrays) -> Scene:
 
 def scene_without_patches(spec: DatasetSpec) -> Scene:
     """Build a scene without searching its load region."""
+    with Problems() as problems:
+        return _with_supports(spec, problems)
+
+
+def _with_supports(spec: DatasetSpec, problems: Problems) -> Scene:
+    """Build the same scene, but leave out supports or springs with errors, which are kept."""
     mesh, surface, point_sets = build_body(spec)
     mesh, point_sets = in_elements(spec, mesh, point_sets)
     cloud = Cloud(mesh.points, np.unique(mesh.boundary_facets), point_sets)
-    material, held = make_material(spec.material), held_by(spec.supports, cloud)
-    springs = foundations(spec, surface or Facets(mesh.points, mesh.boundary_facets), point_sets)
+    held = NOTHING_HELD
+    springs: tuple[Springs, ...] = ()
+    with problems.keep():
+        held = held_by(spec.supports, cloud)
+    with problems.keep():
+        smooth = surface or Facets(mesh.points, mesh.boundary_facets)
+        springs = foundations(spec, smooth, point_sets)
     return Scene(
         spec,
         mesh,
-        material,
+        make_material(spec.material),
         held.fixed_nodes,
         held.held_dofs,
         surface,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from mor_bench.errors import SpecError
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets
 from mor_bench.scene.mesh import Mesh
+from mor_bench.scene.problems import Problems
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.scene.triangle_rules import DEGREE_4, DEGREE_4_WEIGHTS, quadratic_triangle
 from mor_bench.specs import AXES, DatasetSpec
@@ -57,15 +58,24 @@ def foundations(
     Raises
     ------
     SpecError
-        If no facet has all corners in a region.
+        If no facet has all corners in some region.
     """
     cloud, found = Cloud(surface.points, np.unique(surface.facets), point_sets), []
-    for spring in spec.springs:
-        facets = surface.within(region_points(cloud, spring.region))
-        if len(facets) == 0:
-            raise SpecError("a region of `springs` holds no facet of the surface.")
-        found.append(_on_facets(spring, surface, facets))
+    with Problems() as problems:
+        for number, spring in enumerate(spec.springs):
+            with problems.keep():
+                key = f"springs[{number}].region"
+                facets = surface.within(region_points(cloud, spring.region, key))
+                if len(facets) == 0:
+                    raise SpecError(f"`{key}` holds no facet of the surface.")
+                found.append(_on_facets(spring, surface, facets))
     return tuple(found)
+
+
+def matrix_of(springs: Sequence[Springs], mesh: Mesh) -> sp.csr_array | None:
+    """Return the stiffness of all springs over the nodal dofs, N/m; None without springs."""
+    matrices = [each.matrix(mesh) for each in springs]
+    return sp.csr_array(sum(matrices[1:], matrices[0])) if matrices else None
 
 
 def _on_facets(spring: Spring, surface: Facets, facets: NDArray[np.int64]) -> Springs:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.dofs import dofs_of_nodes
+from mor_bench.scene.problems import Problems
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.specs import AXES, Support
 
@@ -82,18 +83,25 @@ class Held:
     frames: Frames | None
 
 
+NOTHING_HELD = Held(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), None)
+
+
 def held_by(supports: Sequence[Support], cloud: Cloud) -> Held:
     """Return what the supports of a dataset file hold.
 
     Raises
     ------
     SpecError
-        If a region is empty, or every node is fixed.
+        If regions are empty, or every node is fixed.
     """
     still = np.zeros((len(cloud.points), 3), dtype=bool)
     oblique: dict[int, list[Array]] = {}
-    for support in supports:
-        nodes = region_points(cloud, support.region)
+    regions = []
+    with Problems() as problems:
+        for number, support in enumerate(supports):
+            with problems.keep():
+                regions.append(region_points(cloud, support.region, f"supports[{number}].region"))
+    for support, nodes in zip(supports, regions, strict=True):
         if support.direction is None:
             still[nodes[:, None], [AXES.index(axis) for axis in support.components]] = True
             continue

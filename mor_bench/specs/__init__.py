@@ -52,6 +52,7 @@ from mor_bench.specs.material_spec import (
     YeohMaterial,
 )
 from mor_bench.specs.method_spec import MethodSpec, all_configurations, check_method
+from mor_bench.specs.one_line_errors import listed
 from mor_bench.specs.parameters import check_parameters, load_class
 from mor_bench.specs.region_spec import (
     BoxRegion,
@@ -65,8 +66,8 @@ from mor_bench.specs.region_spec import (
 from mor_bench.specs.sampled_parameters import (
     LIMITS,
     SampledParameters,
-    check_parameters_of,
     material_with,
+    wrong_parameters,
 )
 from mor_bench.specs.source_file import RECORDED, SourceFile
 from mor_bench.specs.spec_files import (
@@ -136,11 +137,11 @@ __all__ = [
     "all_configurations",
     "check_method",
     "check_parameters",
-    "check_parameters_of",
     "find_suite",
     "generated",
     "is_method_file",
     "list_suite",
+    "listed",
     "load_class",
     "load_dataset_spec",
     "load_generated_spec",
@@ -149,4 +150,5 @@ __all__ = [
     "material_with",
     "tables_of",
     "with_seed",
+    "wrong_parameters",
 ]

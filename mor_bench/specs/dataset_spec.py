@@ -7,24 +7,25 @@ import json
 from math import prod
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.specs.base import Name, Positive, StrictModel, Text
+from mor_bench.specs.contradictions import FIXED_REGIONS, contradiction, contradictions
 from mor_bench.specs.geometry_spec import Geometry
-from mor_bench.specs.loads_spec import (
-    AnyLoads,
-    Contact,
-    LineLoads,
-    LoadPlan,
-    Motion,
-    PointLoads,
-    Pressure,
-    Several,
-)
+from mor_bench.specs.loads_spec import AnyLoads, LoadPlan, Motion
 from mor_bench.specs.material_spec import Discretisation, MaterialSpec, SolverName
 from mor_bench.specs.region_spec import Outputs, Region
-from mor_bench.specs.sampled_parameters import SampledParameters, check_parameters_of
+from mor_bench.specs.sampled_parameters import SampledParameters
 from mor_bench.specs.source_file import File, without_paths
 from mor_bench.specs.split_spec import ExtraTests, ImportedSplit, Split
 from mor_bench.specs.support_spec import Gravity, Spring, Support
@@ -35,9 +36,6 @@ MAX_NODES = 1_000_000
 NO_EQUATIONS = "its snapshots were imported, so its equations are not known"
 NO_FORCES = "its forces are not known, only the displacements of a part of its surface"
 CONTACT = "an instrument presses it, and the method needs given forces"
-
-FIXED_REGIONS = (Motion, Pressure, Contact, Several)
-"""Plans whose samples all act on the same regions."""
 
 Side = Annotated[int, Field(ge=2, le=1024)]
 
@@ -155,7 +153,7 @@ class DatasetSpec(CommonDatasetSpec):
         default=None, exclude_if=lambda value: value is None
     )
     split: Annotated[Split, Field(validate_default=True)] = Split()
-    tests: ExtraTests = ExtraTests()
+    tests: Annotated[ExtraTests, Field(validate_default=True)] = ExtraTests()
 
     @field_validator("split")
     @classmethod
@@ -165,68 +163,30 @@ class DatasetSpec(CommonDatasetSpec):
             return split.model_copy(update={"by": "sample"})
         return split
 
-    @model_validator(mode="after")
-    def _fixed_regions(self) -> Self:
-        """Check what a plan excludes whose samples do not act on one region each."""
-        if not isinstance(self.loads, FIXED_REGIONS):
-            return self
-        where = f"where `loads.kind` is {self.loads.kind!r}"
-        why = "all samples act on the same regions"
-        if isinstance(self.loads, Several):
-            where, why = "with several tables `[[loads]]`", "they act on several regions at once"
-        moves = isinstance(self.loads, Motion | Contact)
-        possible = ("sample", "direction") if moves else ("sample",)
-        if self.split.by not in possible:
-            raise ValueError(
-                f"`split.by` must be {' or '.join(map(repr, possible))} {where}, since {why}; "
-                f"got {self.split.by!r}"
-            )
-        if self.observed is not None and moves:
-            given = "displacements of `loads.region`"
-            if isinstance(self.loads, Contact):
-                given = "displacement of `loads.instrument`"
-            raise ValueError(f"`observed` must be absent {where}: the methods get the {given}")
-        oblique = any(support.direction is not None for support in self.supports)
-        if oblique and isinstance(self.loads, Contact):
-            raise ValueError(f"`supports.direction` must be absent {where}")
-        for name in ("unseen_region", "paper_magnitude_n"):
-            if getattr(self.tests, name) is not None:
-                raise ValueError(f"`tests.{name}` must be absent {where}")
-        return self
-
-    @model_validator(mode="after")
-    def _sampled_parameters(self) -> Self:
-        """Check that the scene can take its sampled parameters."""
-        if self.parameters is None:
-            if "unseen_parameters" in self.tests.model_fields_set:
-                raise ValueError(
-                    "`tests.unseen_parameters` must be absent without the table `parameters`"
+    @field_validator("tests", mode="wrap")
+    @classmethod
+    def _no_contradictions(
+        cls, value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+    ) -> ExtraTests:
+        """Check all valid tables against each other: this is the last one."""
+        tables, problems = dict(info.data), []
+        try:
+            tables["tests"] = handler(value)
+        except ValidationError as error:
+            problems = [
+                InitErrorDetails(
+                    type=each["type"], loc=each["loc"], input=each["input"], ctx=each.get("ctx", {})
                 )
-            return self
-        check_parameters_of(self.parameters, self.material)
-        others = {
-            "`loads.kind` is 'displacement'": isinstance(self.loads, Motion),
-            "`loads.kind` is 'contact'": isinstance(self.loads, Contact),
-            "several tables `[[loads]]` are given": isinstance(self.loads, Several),
-            "`loads.steps` is above 1": self.loads is not None and self.loads.steps > 1,
-            "`supports.direction` is given": any(
-                support.direction is not None for support in self.supports
-            ),
-            "`observed` is given": self.observed is not None,
-            "`needs.stress` is true": self.needs.stress,
-            "`loads.follower` is true": isinstance(self.loads, Pressure) and self.loads.follower,
-        }
-        if found := [other for other, present in others.items() if present]:
-            raise ValueError(f"`parameters` must be absent where {found[0]}")
-        fixed_shape = {
-            "the loads are pressures": isinstance(self.loads, Pressure),
-            "the loads act on points or lines": isinstance(self.loads, PointLoads | LineLoads),
-            "`springs` are given": bool(self.springs),
-        }
-        found = [other for other, present in fixed_shape.items() if present]
-        if self.parameters.scale is not None and found:
-            raise ValueError(f"`parameters.scale` must be absent where {found[0]}")
-        return self
+                for each in error.errors(include_url=False)
+            ]
+        problems += [
+            InitErrorDetails(type=contradiction(sentence), input=None)
+            for sentence in contradictions(tables)
+        ]
+        if problems:
+            raise ValidationError.from_exception_data(cls.__name__, problems)
+        found: ExtraTests = tables["tests"]
+        return found
 
     @property
     def motion(self) -> Motion | None:
@@ -274,11 +234,12 @@ class ImportedDatasetSpec(CommonDatasetSpec):
     snapshots: SnapshotsFile
     split: ImportedSplit = ImportedSplit()
 
-    @model_validator(mode="after")
-    def _no_stress(self) -> Self:
-        if self.needs.stress:
-            raise ValueError("`needs.stress` must be absent: stresses need the equations")
-        return self
+    @field_validator("needs")
+    @classmethod
+    def _no_stress(cls, needs: Needs) -> Needs:
+        if needs.stress:
+            raise contradiction("`needs.stress` must be absent: stresses need the equations")
+        return needs
 
     def physics(self) -> dict[str, Any]:
         physics: dict[str, Any] = without_paths(self.model_dump(mode="json", include={"snapshots"}))

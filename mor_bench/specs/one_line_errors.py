@@ -73,9 +73,15 @@ def _message(problems: Sequence[ErrorDetails], model: type[BaseModel]) -> str:
     """Return a sentence for each problem; unknown keys come first."""
     ordered = sorted(problems, key=lambda problem: problem["type"] != "extra_forbidden")
     read = ordered[:MAX_READ]
-    sentences = list(dict.fromkeys(_sentence(problem, read, model) for problem in read))
-    more = len(sentences) - MAX_PROBLEMS + len(ordered) - len(read)
-    return " ".join(sentences[:MAX_PROBLEMS]) + (f" And {more} more." if more > 0 else "")
+    sentences = [_sentence(problem, read, model) for problem in read]
+    return listed(sentences, len(ordered) - len(read))
+
+
+def listed(sentences: Sequence[str], more: int = 0) -> str:
+    """Return the first different sentences, and the number of all others; ``more`` have none."""
+    different = list(dict.fromkeys(sentences))
+    more += len(different) - MAX_PROBLEMS
+    return " ".join(different[:MAX_PROBLEMS]) + (f" And {more} more." if more > 0 else "")
 
 
 def _sentence(
@@ -86,6 +92,8 @@ def _sentence(
     key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in steps)
     key = key.lstrip(".")
     match problem["type"]:
+        case "contradiction":
+            return f"{problem['msg']}."
         case "extra_forbidden":
             return _unknown_key(key, str(steps[-1]), model, problem["loc"][:-1])
         case "missing":

@@ -119,36 +119,39 @@ class SampledParameters(StrictModel):
         return dict(zip(self.names, zip(lowest, highest, strict=True), strict=True))
 
 
-def check_parameters_of(parameters: SampledParameters, material: MaterialSpec) -> None:
-    """Check sampled parameters against the law of a material.
-
-    Raises
-    ------
-    ValueError
-        If the law has no such parameter, or values that may be drawn are not valid.
-    """
+def wrong_parameters(parameters: SampledParameters, material: MaterialSpec) -> Iterator[str]:
+    """Yield why the law of a material cannot take each of the wrong sampled parameters."""
     own = [name for name in LIMITS if name in type(material).model_fields]
-    for name, (low, high) in parameters.ends().items():
-        if not name.startswith("scale_") and name not in own:
-            raise ValueError(
-                f"`parameters.{name}` cannot be sampled: the law {material.law} has no such "
-                f"parameter; allowed: {', '.join([*own, 'scale'])}"
-            )
-        least, most = LIMITS[name]
-        if not least <= low <= high <= most:
-            key = name.replace("scale_", "scale.")
-            raise ValueError(
-                f"`parameters.{key}` must stay in [{least:.9g}, {most:.9g}]; values from "
-                f"{low:.9g} to {high:.9g} would be drawn"
-            )
+    each = [_wrong(name, ends, material, own) for name, ends in parameters.ends().items()]
+    if any(each):
+        yield from filter(None, each)
+        return
     for corner in _corners(parameters, own):
         try:
             material_with(material, corner)
         except ValidationError as error:
             reason = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
-            raise ValueError(
-                f"`parameters` must stay in the range of the law {material.law}: {reason}"
-            ) from None
+            yield f"`parameters` must stay in the range of the law {material.law}: {reason}"
+            return
+
+
+def _wrong(
+    name: str, ends: tuple[float, float], material: MaterialSpec, own: list[str]
+) -> str | None:
+    """Return why a parameter cannot be drawn between two values; None if it can."""
+    if not name.startswith("scale_") and name not in own:
+        return (
+            f"`parameters.{name}` cannot be sampled: the law {material.law} has no such "
+            f"parameter; allowed: {', '.join([*own, 'scale'])}"
+        )
+    least, most = LIMITS[name]
+    low, high = ends
+    if least <= low <= high <= most:
+        return None
+    return (
+        f"`parameters.{name.replace('scale_', 'scale.')}` must stay in [{least:.9g}, {most:.9g}]; "
+        f"values from {low:.9g} to {high:.9g} would be drawn"
+    )
 
 
 def _corners(parameters: SampledParameters, own: list[str]) -> Iterator[dict[str, float]]:
