@@ -7,6 +7,7 @@ from copy import copy
 from typing import ClassVar, Self
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.counting import count
@@ -21,7 +22,7 @@ from mor_bench.mechanics.accelerated import accelerated, run_in_step
 from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.linear import NotPositiveDefiniteError
 from mor_bench.mechanics.load_steps import LoadSteps
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import CERTIFY_TOLERANCE, FullOrderModel
 from mor_bench.mechanics.newton import (
     MAX_ITERATIONS,
     NewtonOptions,
@@ -31,6 +32,7 @@ from mor_bench.mechanics.newton import (
 )
 from mor_bench.mechanics.pattern import Pattern
 from mor_bench.mechanics.problem import Attempt
+from mor_bench.mechanics.unsymmetric import LU_UP_TO, GeneralFactor, is_stable, whole_matrix
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.triangle_rules import DEGREE_4, DEGREE_4_WEIGHTS, quadratic_triangle
 from mor_bench.specs import SolverName
@@ -119,20 +121,42 @@ class PressedFacets:
         total = np.bincount(self._dofs.ravel(), own.ravel(), minlength=self._n + 1)
         return np.asarray(total[: self._n], dtype=np.float64)
 
-    def stiffness(self, q: Array, pressures: Array) -> Array:
-        """Return the symmetric part of -df/dq in the pattern, N/m.
+    def _moments(self, q: Array) -> Array:
+        """Return the integrals (n_facets, n_corners, n_corners, 3) of N_a (N_b,ξ x_η - N_b,η x_ξ).
 
-        The whole is symmetric if the region is closed, or ends on supports or planes of symmetry.
+        Their cross products with the motion of corner b are the changes of the force at corner a.
         """
         tangents = self._tangents(q)
         spin = np.einsum("pb,fpk->fpbk", self._derivatives[:, :, 0], tangents[:, :, 1])
         spin -= np.einsum("pb,fpk->fpbk", self._derivatives[:, :, 1], tangents[:, :, 0])
         moments = np.einsum("pa,fpbk->fabk", self._values, spin)
+        count(multiply_adds=2 * spin.size + moments.size * len(self._values))
+        return np.asarray(moments)
+
+    def _blocks(self, moments: Array, pressures: Array) -> Array:
+        """Return the facets' matrices (n_facets, n_dofs, n_dofs) of moments under pressures."""
+        own = np.einsum("ijk,fabk,f->faibj", _LEVI_CIVITA, moments, pressures[self.region])
+        count(multiply_adds=own.size)
+        return np.asarray(own).reshape(self._kept.shape)
+
+    def stiffness(self, q: Array, pressures: Array) -> Array:
+        """Return the symmetric part of -df/dq in the pattern, N/m.
+
+        The whole is symmetric if the region is closed, or ends on supports or planes of symmetry.
+        """
+        moments = self._moments(q)
         skew = 0.5 * self._weight * (moments - moments.swapaxes(1, 2))
-        own = np.einsum("ijk,fabk,f->faibj", _LEVI_CIVITA, skew, pressures[self.region])
-        count(multiply_adds=2 * spin.size + moments.size * len(self._values) + own.size)
-        entries = own.reshape(self._kept.shape)[self._kept]
+        entries = self._blocks(skew, pressures)[self._kept]
         return np.asarray(np.bincount(self._slots, entries, self._n_values), dtype=np.float64)
+
+    def skew_stiffness(self, q: Array, pressures: Array) -> sp.csr_array:
+        """Return the skew part of -df/dq, (n, n), N/m."""
+        moments, n = self._moments(q), self._n
+        even = 0.5 * self._weight * (moments + moments.swapaxes(1, 2))
+        blocks, dofs = self._blocks(even, pressures), self._dofs.reshape(len(moments), -1)
+        rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
+        free = (rows < n) & (columns < n)
+        return sp.csr_array((blocks[free], (rows[free], columns[free])), shape=(n, n))
 
 
 class PressedModel(FullOrderModel):
@@ -226,6 +250,46 @@ class PressedModel(FullOrderModel):
             return self._less(state, q), values + self._facets.stiffness(q, self.pressures)
         own = self._facets.stiffness(turned.spread(q), self.pressures)
         return self._less(state, q), values + turned.tangent(own)
+
+    def whole_tangent(self, q: Array, tangent: Array) -> sp.csr_array | None:
+        """Return -df/dq from the values of its symmetric part; None if that is all of it.
+
+        It is also None if there are more than `LU_UP_TO` unknowns.
+        """
+        if self.n_unknowns > LU_UP_TO:
+            return None
+        if (turned := self.assembler.turned) is None:
+            skew = self._facets.skew_stiffness(q, self.pressures)
+        else:
+            skew = turned.matrix(self._facets.skew_stiffness(turned.spread(q), self.pressures))
+        return whole_matrix(self.assembler.pattern.symmetric(tangent), skew)
+
+    def step(self, q: Array, tangent: Array, residual: Array, tolerance: float) -> Array:
+        """Solve with the whole tangent, whose symmetric part is given; it may be indefinite."""
+        whole = self.whole_tangent(q, tangent)
+        if whole is None:
+            try:
+                return super().step(q, tangent, residual, tolerance)
+            except NotPositiveDefiniteError:
+                if self.n_unknowns > LU_UP_TO:
+                    raise
+                whole = self.assembler.pattern.symmetric(tangent)
+        return GeneralFactor(whole).solve(residual)
+
+    def certify(self, q: Array) -> None:
+        """Raise `NotPositiveDefiniteError` if the equilibrium q is found unstable.
+
+        It is stable if the symmetric part of its tangent is positive definite. Otherwise, the
+        eigenvalues of the whole tangent decide.
+        """
+        tangent = self.linearise(q)[1]
+        force = np.random.default_rng(0).normal(size=self.n_unknowns)
+        try:
+            super().step(q, tangent, force, CERTIFY_TOLERANCE)
+        except NotPositiveDefiniteError:
+            whole, symmetric = self.whole_tangent(q, tangent), self.assembler.pattern.symmetric
+            if whole is None or not is_stable(whole, symmetric(self.rest_tangent)):
+                raise
 
     def solve(
         self,

@@ -84,6 +84,10 @@ class TurnedDofs:
         count(multiply_adds=self._values.nnz)
         return np.asarray(self._values @ values)
 
+    def matrix(self, matrix: sp.csr_array) -> sp.csr_array:
+        """Return Tᵀ K T for a K that need not be symmetric."""
+        return sp.csr_array(self._transposed @ matrix @ self._matrix)
+
     def cell_forces(self, forces: Array, cells: NDArray[np.int64]) -> Array:
         """Return the forces (n_cells, 3 n_nodes) of cells, N, in the frames of their nodes."""
         out = forces.reshape(*cells.shape, 3).copy()
