@@ -292,7 +292,8 @@ def compare_on(
         for row in rows
     ]
     chosen = {"amplitudes_m": sorted(amplitudes)} if amplitudes else {"samples": samples}
-    return {**chosen, "load_norms_n": norms, "contenders": contenders}
+    size = {"n_unknowns": len(scene.free_dofs)}
+    return {**size, **chosen, "load_norms_n": norms, "contenders": contenders}
 
 
 @with_options

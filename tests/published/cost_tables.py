@@ -87,11 +87,19 @@ def generation(source: str) -> str:
 
 def large_deformation(source: str) -> str:
     """Show the time of a solve and the ratio of another code's, by the displacement of the end."""
-    found = content_of(source)["datasets"]["beam-fine"]
-    own, peer = (np.median(np.array(row["times_ms"]), axis=1) for row in found["contenders"])
-    steps = found["contenders"][0]["steps"]
-    body = [
-        [f"{amplitude:g}", f"{n}", number(float(ms)), number(float(other / ms))]
-        for amplitude, n, ms, other in zip(found["amplitudes_m"], steps, own, peer, strict=True)
-    ]
-    return markdown(["end moves, m", "back-solves", "`auto`, ms", "felupe, Pardiso: ratio"], body)
+    body = []
+    for found in content_of(source)["datasets"].values():
+        own, peer = (np.median(np.array(row["times_ms"]), axis=1) for row in found["contenders"])
+        columns = found["amplitudes_m"], found["contenders"][0]["steps"], own, peer
+        body += [
+            [
+                f"{found['n_unknowns']:,}",
+                f"{amplitude:g}",
+                f"{n}",
+                number(float(ms)),
+                number(float(other / ms)),
+            ]
+            for amplitude, n, ms, other in zip(*columns, strict=True)
+        ]
+    headings = ["unknowns", "end moves, m", "back-solves", "`auto`, ms", "felupe, Pardiso: ratio"]
+    return markdown(headings, body)
