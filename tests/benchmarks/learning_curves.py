@@ -32,8 +32,6 @@ METHODS: dict[str, dict[str, Any]] = {
     "autoencoder": {},
     "pod-deeponet": LINEAR_RESPONSE,
     "deeponet": LINEAR_RESPONSE,
-    "fno": LINEAR_RESPONSE,
-    "transolver": LINEAR_RESPONSE,
 }
 """Methods, and parameters that replace those of their files."""
 
