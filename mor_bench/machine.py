@@ -7,12 +7,13 @@ import platform
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import psutil
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 MEMBERSHIP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 
@@ -73,6 +74,21 @@ def pinned_threads(threads: int) -> Iterator[None]:
             _kernel_threads = kernels_before
             if torch:
                 torch.set_num_threads(before)
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+@contextmanager
+def kernels_alone() -> Iterator[None]:
+    """Let BLAS use one thread where kernels use more: its waiting threads would slow them down."""
+    if _kernel_threads == 1:
+        yield
+        return
+    with _libraries().limit(limits=1, user_api="blas"):
+        yield
 
 
 def memory_limit_bytes(membership: Path = MEMBERSHIP, groups: Path = GROUPS) -> float:

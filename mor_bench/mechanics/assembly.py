@@ -229,6 +229,11 @@ class Assembler:
         energies, min_dets = zip(*self._slabs.run(sum_of), strict=True)
         return sum(energies), min(min_dets)
 
+    @property
+    def in_slabs(self) -> bool:
+        """Whether cells are summed in slabs, on as many threads as kernels may use."""
+        return self._slabs is not None
+
     def _chosen(self, chosen: slice) -> Batches:
         """Return the data of some batches of cells."""
         # One batch of gradients serves all if cells are equal.

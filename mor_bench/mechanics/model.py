@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import cached_property
 from importlib.util import find_spec
@@ -21,6 +22,7 @@ from mor_bench.errors import (
     SpecError,
     UnsupportedSceneError,
 )
+from mor_bench.machine import kernels_alone
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.banded import BandedCholesky, BandedFactor
 from mor_bench.mechanics.discretisation import Discretisation, body_force, discretisation_of
@@ -365,7 +367,11 @@ class FullOrderModel:
         options: NewtonOptions = NewtonOptions(),
     ) -> Solution:
         """Solve for forces on the free dofs, (n_free,) N; see `solve_equilibrium`."""
-        return solve_equilibrium(self, load, start, options)
+        with self._threads():
+            return solve_equilibrium(self, load, start, options)
+
+    def _threads(self) -> AbstractContextManager[None]:
+        return kernels_alone() if self.assembler.in_slabs else nullcontext()
 
     def solve_many(
         self,
@@ -377,5 +383,6 @@ class FullOrderModel:
 
         Returns solutions, or the errors `solve` would raise.
         """
-        found = dict(solve_equilibria(self, list(loads), starts, options))
+        with self._threads():
+            found = dict(solve_equilibria(self, list(loads), starts, options))
         return [found[i] for i in range(len(loads))]
