@@ -63,7 +63,8 @@ def fastest_within(points: Sequence[Point], target: float) -> Point | None:
 def most_accurate_within(points: Sequence[Point], target_ms: float) -> Point | None:
     """Return the point with the least `selecting` error among those that are fast enough."""
     able = [p for p in points if p.latency_ms <= target_ms and p.selecting < USELESS]
-    return min(able, key=lambda p: (p.selecting, p.latency_ms), default=None)
+    # Errors that differ in round-off are equal: two sizes may have become the same model.
+    return min(able, key=lambda p: (float(f"{p.selecting:.5g}"), p.latency_ms), default=None)
 
 
 def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
