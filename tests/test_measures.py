@@ -106,6 +106,14 @@ def test_answers_worse_than_zero_are_on_no_front() -> None:
     assert error_at_time(useless, 1.0) == {"error": None, "best": None}
 
 
+def test_of_errors_that_differ_in_round_off_the_faster_one_is_chosen() -> None:
+    same = [Point(2.0, 0.01, "large", 0.02 - 1e-12), Point(1.0, 0.01, "small", 0.02)]
+    for points in (same, same[::-1]):
+        found = error_at_time(points, 3.0)["best"]
+        assert found is not None
+        assert found["label"] == "small"
+
+
 def test_validation_selects_and_the_errors_are_those_of_the_test() -> None:
     points = [
         Point(1.0, 0.04, "fast", 0.02),
