@@ -164,7 +164,6 @@ def pressed_patches(
     fine : bool
         Whether the points serve meshes with divided facets too. Few points per facet give the
         consistent load of its own mesh, and forces at single nodes of a fine one.
-
     """
     if fine:
         rules = [
