@@ -1,4 +1,4 @@
-"""Back ends that compute a network's answers on processors, and the choice of the fastest one.
+"""Back ends that compute a network's answers, and the choice of the fastest one.
 
 torch's own convolutions are slow for single samples. Every call copies the weights into oneDNN's
 layout, or does not use oneDNN. The back ends are:
@@ -8,6 +8,8 @@ layout, or does not use oneDNN. The back ends are:
   torch.compile emits these operations for frozen graphs; called directly, they need no compiler.
 - ``packed-bfloat16``: the same with weights and activations in bfloat16 and sums in float32.
 - ``onnx``: ONNX Runtime, float32.
+- ``cuda``: the first graphics processor, with the products of its tensor cores (TF32). It is never
+  chosen automatically, because other methods answer on a processor.
 """
 
 from __future__ import annotations
@@ -22,13 +24,15 @@ import torch
 from torch import Tensor, nn
 
 from mor_bench.errors import FallbackWarning, UnavailableBackendError
+from mor_bench.learning.cuda_graphs import ReplayedNetwork
 from mor_bench.learning.onnx_graph import OnnxSession
 from mor_bench.learning.packed_network import packed
 
-Backend = Literal["eager", "packed", "onnx", "packed-bfloat16"]
+Backend = Literal["eager", "packed", "onnx", "packed-bfloat16", "cuda"]
 
-BACKENDS: tuple[Backend, ...] = get_args(Backend)
-"""Back ends from simple to complex. Each must be clearly faster than the choice before it."""
+BACKENDS: tuple[Backend, ...] = get_args(Backend)[:-1]
+"""Back ends of processors, from simple to complex. Each must be clearly faster than the choice
+before it."""
 
 CLEAR_GAIN: dict[Backend, float] = {"packed": 1.1, "onnx": 1.5, "packed-bfloat16": 1.2}
 """Required speed-up over the simpler choice. Measured ratios are far from it, so noise seldom
@@ -52,7 +56,7 @@ class Inference:
         A fitted network on the processor, with one input and one output tensor. Later changes of
         its weights have no effect.
     backend : str
-        One of `BACKENDS`.
+        One of `BACKENDS`, or "cuda".
 
     Raises
     ------
@@ -66,6 +70,8 @@ class Inference:
         self._function: Callable[[Tensor], Tensor] = network
         if backend == "onnx":
             self._function = OnnxSession(network)
+        elif backend == "cuda":
+            self._function = ReplayedNetwork(network)
         elif backend != "eager":
             self._function = packed(
                 network, torch.float32 if backend == "packed" else torch.bfloat16

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError, OutOfTimeError
 from mor_bench.learning.checkpoint import fingerprint_of, resume, write_checkpoint
+from mor_bench.learning.cuda_graphs import own_stream
 from mor_bench.learning.training_loop import TrainingLoop
 from mor_bench.learning.training_plan import LearningProblem, TrainingPlan
 from mor_bench.training_options import TrainingOptions
@@ -100,7 +102,13 @@ def train(
         If the checkpoint belongs to another training.
     """
     options = options or TrainingOptions()
-    loop = TrainingLoop(problem, plan, options, device_of(options))
+    device = device_of(options)
+    with own_stream() if device.type == "cuda" else nullcontext():
+        return _trained(TrainingLoop(problem, plan, options, device), time_limit_s)
+
+
+def _trained(loop: TrainingLoop, time_limit_s: float | None) -> Training:
+    problem, options = loop.problem, loop.options
     checkpoint = options.checkpoint
     fingerprint = "" if checkpoint is None else _fingerprint(problem, options)
     if checkpoint is None or not resume(loop, checkpoint, fingerprint):

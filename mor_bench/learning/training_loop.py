@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mor_bench.errors import MorBenchError
+from mor_bench.learning.cuda_graphs import N_UNRECORDED, RecordedStep
 from mor_bench.learning.training_plan import LearningProblem, TrainingPlan, rate_factor
 from mor_bench.training_options import TrainingOptions
 
@@ -69,6 +70,9 @@ class TrainingLoop:
         self.order = torch.empty(0, dtype=torch.int64)
         self.total = torch.zeros((), device=device)
         self.best: dict[str, Tensor] = {}
+        self._n_unrecorded = N_UNRECORDED if problem.repeats and device.type == "cuda" else 0
+        self._n_taken = 0
+        self._recorded: RecordedStep | None = None
         self.network.train()
 
     @property
@@ -114,7 +118,8 @@ class TrainingLoop:
         trial_options = TrainingOptions(device=self.options.device)
         trial = TrainingLoop(self.problem, self.plan, trial_options, self.device)
         trial.iterations, trial.rows = self.plan.iterations, self.rows
-        trial.step()  # the first step includes one-time set-up
+        for _ in range(1 + self._n_unrecorded):  # they include one-time set-up
+            trial.step()
         start = now = self._now()
         done = 0
         while done < 3 or (done < TRIAL_ITERATIONS and now - start < TRIAL_SHARE * seconds):
@@ -146,20 +151,38 @@ class TrainingLoop:
             self.order = self.rows[torch.randperm(len(self.rows), generator=self.generator)]
         rows, self.order = self.order[:batch_size], self.order[batch_size:]
         factor = rate_factor(plan.schedule, self.iteration, self.iterations)
-        for group in self.optimiser.param_groups:
-            group["lr"] = plan.learning_rate * factor
-        with self._products():
-            loss = self.problem.loss(rows.to(self.device))
-        self.optimiser.zero_grad()
-        torch.autograd.backward(loss)
-        self.optimiser.step()
+        loss = self._take(rows.to(self.device), plan.learning_rate * factor)
         self.iteration += 1
-        self.total, self.n_summed = self.total + loss.detach().float(), self.n_summed + 1
+        self.total, self.n_summed = self.total + loss.float(), self.n_summed + 1
         last = self.iteration == self.iterations
         if self.n_summed == LOSS_INTERVAL or last:
             self._record()
         if len(self.held) and (self.iteration % self.validation_interval == 0 or last):
             self.validate()
+
+    def _take(self, rows: Tensor, rate: float) -> Tensor:
+        """Take a step, on a graphics processor by replay if possible; return the loss before it."""
+        self._n_taken += 1
+        groups = self.optimiser.param_groups
+        if self._recorded is None and 0 < self._n_unrecorded < self._n_taken:
+            for group in groups:
+                group["capturable"], group["lr"] = True, torch.tensor(rate, device=self.device)
+            self._recorded = RecordedStep(self._changed, rows)
+        for group in groups:
+            if self._recorded is None:
+                group["lr"] = rate
+            else:
+                group["lr"].fill_(rate)
+        return self._changed(rows) if self._recorded is None else self._recorded(rows)
+
+    def _changed(self, rows: Tensor) -> Tensor:
+        """Change the weights by the gradient of the loss of some samples; return the loss."""
+        with self._products():
+            loss = self.problem.loss(rows)
+        self.optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        self.optimiser.step()
+        return loss.detach()
 
     def _products(self) -> AbstractContextManager[object]:
         if self.plan.precision == "bfloat16":

@@ -70,6 +70,9 @@ class LearningProblem:
         Hyperparameters of the method as JSON values; they identify a training too.
     n_validation : int
         Number of validation samples; their indices follow those of the training samples.
+    repeats : bool
+        True if the loss does the same operations with every batch, and draws no random number. Then
+        a graphics processor replays a recorded step.
     """
 
     network: nn.Module
@@ -79,6 +82,7 @@ class LearningProblem:
     arrays: Mapping[str, Tensor] = field(default_factory=dict)
     knobs: Mapping[str, object] = field(default_factory=dict)
     n_validation: int = 0
+    repeats: bool = False
 
 
 def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:

@@ -79,6 +79,11 @@ class FieldSurrogate(Surrogate, ABC):
     curves: ClassVar[tuple[str, ...]] = ("loss_curve",)
     """Curves of `Training` that the model keeps."""
 
+    @property
+    def repeats(self) -> bool:
+        """True if the loss does the same operations with every batch, see `LearningProblem`."""
+        return False
+
     network_: nn.Module
     loss_curve_: Array
     response_: LinearResponse
@@ -169,7 +174,7 @@ class FieldSurrogate(Surrogate, ABC):
         self.network_ = network.cpu()
         self.finish(_single(inputs), _single(targets))
         weights = self.network_.state_dict()
-        model |= {f"network.{name}": value.numpy() for name, value in weights.items()}
+        model |= {f"network.{name}": value.contiguous().numpy() for name, value in weights.items()}
         model |= {name: getattr(done, name) for name in self.curves}
         model["iterations"] = np.array([done.iterations])
         return model
@@ -194,7 +199,14 @@ class FieldSurrogate(Surrogate, ABC):
         n_train = len(known[0][0])
         n_validation = len(inputs) - n_train
         problem = LearningProblem(
-            network, loss, n_train, generator, data, self.parameters, n_validation
+            network,
+            loss,
+            n_train,
+            generator,
+            data,
+            self.parameters,
+            n_validation,
+            self.repeats,
         )
         return train(problem, self.plan(), self.training, self.time_limit_s)
 

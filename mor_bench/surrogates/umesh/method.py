@@ -13,6 +13,7 @@ from pydantic import Field
 from torch import Tensor
 
 from mor_bench.errors import UnsupportedSceneError
+from mor_bench.learning.cuda_graphs import volumes_last
 from mor_bench.learning.inference import (
     Backend,
     Inference,
@@ -160,6 +161,8 @@ class UMesh(FieldSurrogate):
         self, network: UNet, data: dict[str, Tensor], generator: torch.Generator
     ) -> Loss:
         inputs, targets = data["inputs"], data["targets"]
+        if inputs.is_cuda:
+            volumes_last(network)
         weights, zero = self._sample_weights(targets), torch.zeros_like(inputs[:1])
         images = [Image(mirror, inputs.device) for mirror in self._mirrors()]
 
@@ -177,6 +180,10 @@ class UMesh(FieldSurrogate):
             return (errors * weights[rows]).sum() * (1.0 / y.numel())
 
         return loss
+
+    @property
+    def repeats(self) -> bool:
+        return not self._mirrors()
 
     def plan(self) -> TrainingPlan:
         return TrainingPlan(

@@ -48,14 +48,13 @@ class PaddedGrid:
 
     def to_grid(self, forces: Tensor) -> Tensor:
         """Nᵀ f: (n, n_nodes, 3) → (n, 3, x, y, z), zeros at padding, channels-last in memory."""
-        if self.places is None:
-            flat = torch.from_numpy(self.grid.forces_to_grid(forces.cpu().numpy())).to(
-                forces.device
-            )
+        n_points = self.grid.weights.shape[1]
+        if forces.is_cuda:
+            flat = self._on_cuda[1](forces)
+        elif self.places is None:
+            flat = torch.from_numpy(self.grid.forces_to_grid(forces.numpy()))
         else:
-            flat = forces.new_zeros(len(forces), self.grid.weights.shape[1], 3).index_copy_(
-                1, self.places.to(forces.device), forces
-            )
+            flat = forces.new_zeros(len(forces), n_points, 3).index_copy_(1, self.places, forces)
         return flat.view(-1, *self.shape, 3).permute(0, 4, 1, 2, 3)
 
     def displacements_to_grid(self, displacements: Tensor) -> Tensor:
@@ -66,7 +65,14 @@ class PaddedGrid:
         """
         if self.places is not None:
             return self.to_grid(displacements)
-        return self.to_grid(displacements) / self.shares.to(displacements.device)
+        shares = self._on_cuda[2] if displacements.is_cuda else self.shares
+        return self.to_grid(displacements) / shares
+
+    @cached_property
+    def _on_cuda(self) -> tuple[_Rows, _Rows, Tensor]:
+        """N, its transpose and `shares` on the graphics processor."""
+        transposed = sp.csr_array(self.grid.weights.T)
+        return _Rows.of(self.grid.weights), _Rows.of(transposed), self.shares.to("cuda")
 
     @cached_property
     def shares(self) -> Tensor:
@@ -78,6 +84,39 @@ class PaddedGrid:
         """N u: (n, 3, x, y, z) → (n, n_nodes, 3), differentiable."""
         nodal: Tensor = _ToNodes.apply(values, self)  # type: ignore[no-untyped-call]
         return nodal
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """A sparse matrix with as many entries in every row, for products on a graphics processor.
+
+    Its products add in a fixed order. A recorded step can hold them, which it cannot do with a
+    product of SciPy.
+
+    Attributes
+    ----------
+    columns : (n_rows, n_entries) int64 tensor
+    weights : (n_rows, n_entries, 1) float32 tensor
+        Zero in the entries that fill a row.
+    """
+
+    columns: Tensor
+    weights: Tensor
+
+    @classmethod
+    def of(cls, matrix: sp.csr_array) -> _Rows:
+        lengths = np.diff(matrix.indptr)
+        width = int(lengths.max())
+        columns = np.zeros((len(lengths), width), dtype=np.int64)
+        weights = np.zeros((len(lengths), width, 1), dtype=np.float32)
+        rows = np.repeat(np.arange(len(lengths)), lengths)
+        entries = np.arange(matrix.nnz) - np.repeat(matrix.indptr[:-1], lengths)
+        columns[rows, entries], weights[rows, entries, 0] = matrix.indices, matrix.data
+        return cls(torch.from_numpy(columns).to("cuda"), torch.from_numpy(weights).to("cuda"))
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """(n, n_columns, 3) → (n, n_rows, 3)."""
+        return (values[:, self.columns] * self.weights).sum(dim=2)
 
 
 class _ToNodes(torch.autograd.Function):
@@ -95,11 +134,11 @@ class _ToNodes(torch.autograd.Function):
             .permute(0, 2, 3, 4, 1)
             .reshape(len(values), padded.grid.weights.shape[1], 3)
         )
+        if flat.is_cuda:
+            return padded._on_cuda[0](flat)
         if padded.places is None:
-            return torch.from_numpy(padded.grid.displacements_to_nodes(flat.cpu().numpy())).to(
-                values.device
-            )
-        return flat.index_select(1, padded.places.to(values.device))
+            return torch.from_numpy(padded.grid.displacements_to_nodes(flat.numpy()))
+        return flat.index_select(1, padded.places)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:

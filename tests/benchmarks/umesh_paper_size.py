@@ -1,0 +1,215 @@
+"""Train U-Mesh in the paper's sizes on a graphics processor, and time its queries there.
+
+    python -m tests.benchmarks.umesh_paper_size --json umesh-paper-size.json
+
+The datasets have the paper's deformation, the split is at random, and a batch has four samples, as
+in the paper. The trainings of all scenes run side by side, each in its own stream, because one
+small batch does not fill a graphics processor. Times of queries are measured after all trainings.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event, Thread
+from time import perf_counter
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from numpy.typing import NDArray
+
+import mor_bench
+from mor_bench.learning.cuda_graphs import ReplayedNetwork, volumes_last
+from mor_bench.machine import gpu_name
+from mor_bench.measure.error_metrics import sample_errors, summary
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.patch_loads import PatchLoads
+from mor_bench.snapshots.store import write_atomically
+from mor_bench.training_options import TrainingOptions
+
+SIZES = {
+    "beam-coarse-paper": (128, 3),
+    "beam-coarse-3-forces-paper": (64, 4),
+    "l-shape-paper": (128, 3),
+    "liver-hex-paper": (128, 3),
+    "liver-tet": (128, 3),
+    "beam-fine-paper": (128, 3),
+}
+"""Channels and steps of the paper's network for each scene."""
+
+SCORES = (
+    "mean_dof_m",
+    "std_dof_m",
+    "max_dof_m",
+    "slope",
+    "rel_l2_median",
+    "rel_l2_p95",
+    "rel_l2_max",
+    "amplitude_m",
+)
+N_QUERIES, N_WARM_UP = 200, 20
+
+
+@dataclass
+class Contestant:
+    """A scene with its network in training.
+
+    Attributes
+    ----------
+    method : Surrogate
+    seconds : float
+        Wall time of the fit, beside the other trainings.
+    error : Exception or None
+        What ended the training, if it did not end by itself.
+    """
+
+    name: str
+    data: Dataset
+    method: Any
+    started: Event = field(default_factory=Event)
+    seconds: float = 0.0
+    error: Exception | None = None
+
+    def fit(self) -> None:
+        begun = perf_counter()
+        try:
+            self.method.training = TrainingOptions(device="cuda", progress=self._progress)
+            self.method.fit(self.data.scene, without_validation(self.data))
+        except Exception as error:
+            self.error = error
+        self.seconds = perf_counter() - begun
+        self.started.set()
+
+    def _progress(self, done: int, planned: int, loss: float) -> None:
+        self.started.set()
+        if done % (planned // 20) == 0:
+            print(f"{self.name}: {done} of {planned}, loss {loss:.3g}", flush=True)
+
+
+def without_validation(data: Dataset) -> Snapshots:
+    """Return the samples of training and validation; nothing is chosen, and the paper has two parts."""
+    parts = data.train, data.validation
+    loads = [part.loads for part in parts if isinstance(part.loads, PatchLoads)]
+    return Snapshots(
+        data.scene,
+        PatchLoads(
+            np.concatenate([load.patches for load in loads]),
+            np.concatenate([load.vectors for load in loads]),
+        ),
+        np.concatenate([part.free_displacements for part in parts]),
+        np.concatenate([part.min_det_f for part in parts]),
+    )
+
+
+def queries_ms(function: Any, inputs: list[Any]) -> dict[str, float]:
+    """Return median and 95th percentile of the time of single queries, ms."""
+    times: list[float] = []
+    for query in range(N_WARM_UP + N_QUERIES):
+        given = inputs[query % len(inputs)]
+        begun = perf_counter()
+        function(given)
+        times.append(1e3 * (perf_counter() - begun))
+    kept = times[N_WARM_UP:]
+    return {"median": float(np.median(kept)), "p95": float(np.percentile(kept, 95))}
+
+
+@torch.inference_mode()
+def latency(contestant: Contestant) -> dict[str, Any]:
+    """Return the times of single queries: whole ones, and the network with and without replay."""
+    method = contestant.method
+    shape = method.grid_.shape
+    given = [torch.randn(1, *shape, 3).permute(0, 4, 1, 2, 3) for _ in range(8)]
+    on_device = volumes_last(method.network_.to("cuda"))
+
+    def launched(inputs: torch.Tensor) -> torch.Tensor:
+        answer: torch.Tensor = on_device(inputs.to("cuda")).cpu()
+        return answer
+
+    forces = [contestant.data.test.forces[i] for i in range(8)]
+    return {
+        "replayed": queries_ms(ReplayedNetwork(method.network_), given),
+        "launched": queries_ms(launched, given),
+        "predict": queries_ms(method.predict, forces),
+    }
+
+
+def scored(contestant: Contestant) -> dict[str, float]:
+    """Return the errors of all test samples, predicted on the graphics processor."""
+    test = contestant.data.test
+    predicted: NDArray[np.float64] = np.concatenate(
+        [contestant.method.predict(test[i : i + 64].forces) for i in range(0, len(test), 64)]
+    )
+    found = summary(sample_errors(predicted, test.displacements))
+    return {name: float(found[name]) for name in SCORES if name in found}
+
+
+def row_of(contestant: Contestant) -> dict[str, Any]:
+    method, data = contestant.method, contestant.data
+    row: dict[str, Any] = {"dataset": contestant.name}
+    if contestant.error is not None:
+        return row | {"error": str(contestant.error)}
+    return row | {
+        "channels": method.channels,
+        "steps": method.steps,
+        "iterations": method.iterations,
+        "batch_size": method.batch_size,
+        "learning_rate": method.learning_rate,
+        "schedule": method.schedule,
+        "precision": method.precision,
+        "seed": method.seed,
+        "n_weights": sum(p.numel() for p in method.network_.parameters()),
+        "n_train": len(data.train) + len(data.validation),
+        "fit_s": contestant.seconds,
+        "loss_curve": [
+            float(f"{x:.4g}") for x in method.loss_curve_[:: max(1, len(method.loss_curve_) // 100)]
+        ],
+        "test": scored(contestant),
+        "latency_ms": latency(contestant),
+    }
+
+
+def main(
+    scenes: Annotated[list[str] | None, typer.Argument(help="Datasets; by default all.")] = None,
+    iterations: Annotated[int, typer.Option(help="As in the paper.")] = 100_000,
+    learning_rate: Annotated[float, typer.Option(help="Peak of the schedule.")] = 3e-4,
+    precision: Annotated[str, typer.Option(help="float32 or bfloat16.")] = "bfloat16",
+    report: Annotated[Path, typer.Option("--json", metavar="FILE")] = Path("umesh-paper-size.json"),
+) -> None:
+    """Train U-Mesh in the paper's sizes on a graphics processor, and time its queries there."""
+    contestants, threads = [], []
+    begun = perf_counter()
+    for name in scenes or list(SIZES):
+        channels, steps = SIZES[name]
+        method = mor_bench.load_method(
+            "umesh",
+            channels=channels,
+            steps=steps,
+            iterations=iterations,
+            learning_rate=learning_rate,
+            schedule="one-cycle",
+            precision=precision,
+            inference="cuda",
+        )
+        one = Contestant(name, mor_bench.load_dataset(name, split="sample"), method)
+        print(
+            f"{name}: {len(one.data.train)} samples after {perf_counter() - begun:.0f} s",
+            flush=True,
+        )
+        contestants.append(one)
+        threads.append(Thread(target=one.fit))
+        threads[-1].start()
+        one.started.wait()  # one recording at a time
+    for thread in threads:
+        thread.join()
+    rows = [row_of(one) for one in contestants]
+    found = {"gpu": gpu_name(), "torch": torch.__version__, "side_by_side": len(rows), "rows": rows}
+    write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
+    for row in rows:
+        print(row["dataset"], row.get("error") or (row["test"], row["latency_ms"]), flush=True)
+
+
+if __name__ == "__main__":
+    typer.run(main)
