@@ -90,7 +90,7 @@ class Contestant:
 
 
 def without_validation(data: Dataset) -> Snapshots:
-    """Return the samples of training and validation; nothing is chosen, and the paper has two parts."""
+    """Return the samples of training and validation; nothing is chosen by validation."""
     parts = data.train, data.validation
     loads = [part.loads for part in parts if isinstance(part.loads, PatchLoads)]
     return Snapshots(
