@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a C
 
 TINY = {"channels": 8, "steps": 1, "iterations": 60, "batch_size": 8, "learning_rate": 1e-3}
 ROUNDING = 2e-2
-"""Relative difference of answers after `TINY`'s training; tensor cores round products to TF32."""
+"""Relative difference of answers; tensor cores round products to TF32."""
 
 
 @pytest.fixture(scope="module", params=["beam-tiny", "beam-tet"])
@@ -42,7 +42,10 @@ def difference(one: np.ndarray, other: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", ["umesh", "umesh-linear"])
-def test_a_training_on_a_graphics_processor_gives_the_same_model(data: Dataset, name: str) -> None:
+def test_a_training_on_a_graphics_processor_gives_the_same_model(
+    data: Dataset, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)  # Adam amplifies rounding
     own, other = (fitted(data, device, name) for device in ("cuda", "cpu"))
     forces = data.test.forces
     assert difference(own.predict(forces), other.predict(forces)) < ROUNDING
@@ -74,7 +77,7 @@ def test_a_stopped_training_resumes(
         pass
 
     def stop(done: int, *_: object) -> None:
-        if done >= 50:
+        if done >= TINY["iterations"] - 10:
             raise StopError
 
     with pytest.raises(StopError):

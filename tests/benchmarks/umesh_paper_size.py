@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Event, Thread
 from time import perf_counter
 from typing import Annotated, Any
@@ -49,8 +50,10 @@ SCORES = (
     "rel_l2_p95",
     "rel_l2_max",
     "amplitude_m",
+    "tip_rel_at_max_e",
+    "tip_rel_at_largest",
 )
-N_QUERIES, N_WARM_UP = 200, 20
+N_QUERIES, N_WARM_UP, N_POINTS = 200, 20, 100
 
 
 @dataclass
@@ -60,6 +63,10 @@ class Contestant:
     Attributes
     ----------
     method : Surrogate
+    finished : SimpleQueue
+        Receives this object when its training has ended.
+    started : Event
+        Set when the steps are recorded.
     seconds : float
         Wall time of the fit, beside the other trainings.
     error : Exception or None
@@ -69,6 +76,7 @@ class Contestant:
     name: str
     data: Dataset
     method: Any
+    finished: SimpleQueue[Contestant]
     started: Event = field(default_factory=Event)
     seconds: float = 0.0
     error: Exception | None = None
@@ -82,6 +90,7 @@ class Contestant:
             self.error = error
         self.seconds = perf_counter() - begun
         self.started.set()
+        self.finished.put(self)
 
     def _progress(self, done: int, planned: int, loss: float) -> None:
         self.started.set()
@@ -147,68 +156,73 @@ def scored(contestant: Contestant) -> dict[str, float]:
 
 
 def row_of(contestant: Contestant) -> dict[str, Any]:
+    """Return the setting of a training, its loss over the iterations, and its errors."""
     method, data = contestant.method, contestant.data
     row: dict[str, Any] = {"dataset": contestant.name}
     if contestant.error is not None:
-        return row | {"error": str(contestant.error)}
+        return row | {"error": repr(contestant.error)}
+    names = ("channels", "steps", "iterations", "batch_size", "learning_rate", "schedule")
+    curve = method.loss_curve_[:: max(1, len(method.loss_curve_) // N_POINTS)]
     return row | {
-        "channels": method.channels,
-        "steps": method.steps,
-        "iterations": method.iterations,
-        "batch_size": method.batch_size,
-        "learning_rate": method.learning_rate,
-        "schedule": method.schedule,
-        "precision": method.precision,
-        "seed": method.seed,
-        "n_weights": sum(p.numel() for p in method.network_.parameters()),
+        **{name: getattr(method, name) for name in (*names, "precision", "seed")},
+        "n_weights": sum(weights.numel() for weights in method.network_.parameters()),
         "n_train": len(data.train) + len(data.validation),
+        "n_test": len(data.test),
         "fit_s": contestant.seconds,
-        "loss_curve": [
-            float(f"{x:.4g}") for x in method.loss_curve_[:: max(1, len(method.loss_curve_) // 100)]
-        ],
+        "loss_curve": [float(f"{loss:.4g}") for loss in curve],
         "test": scored(contestant),
-        "latency_ms": latency(contestant),
     }
 
 
+def contestant_of(text: str, iterations: int, finished: SimpleQueue[Contestant]) -> Contestant:
+    """Return the paper's network for a scene, from DATASET or DATASET:ITERATIONS."""
+    name, _, own = text.partition(":")
+    channels, steps = SIZES[name]
+    method = mor_bench.load_method(
+        "umesh",
+        channels=channels,
+        steps=steps,
+        iterations=int(own or iterations),
+        schedule="one-cycle",
+        precision="bfloat16",
+        inference="cuda",
+    )
+    return Contestant(name, mor_bench.load_dataset(name, split="sample"), method, finished)
+
+
 def main(
-    scenes: Annotated[list[str] | None, typer.Argument(help="Datasets; by default all.")] = None,
-    iterations: Annotated[int, typer.Option(help="As in the paper.")] = 100_000,
-    learning_rate: Annotated[float, typer.Option(help="Peak of the schedule.")] = 3e-4,
-    precision: Annotated[str, typer.Option(help="float32 or bfloat16.")] = "bfloat16",
-    report: Annotated[Path, typer.Option("--json", metavar="FILE")] = Path("umesh-paper-size.json"),
+    scenes: Annotated[
+        list[str] | None, typer.Argument(help="DATASET or DATASET:ITERATIONS; by default all.")
+    ] = None,
+    iterations: Annotated[int, typer.Option(help="By default as in the paper.")] = 100_000,
+    report: Annotated[
+        Path, typer.Option("--json", metavar="FILE", help="Write the rows here.")
+    ] = Path("umesh-paper-size.json"),
 ) -> None:
     """Train U-Mesh in the paper's sizes on a graphics processor, and time its queries there."""
-    contestants, threads = [], []
-    begun = perf_counter()
-    for name in scenes or list(SIZES):
-        channels, steps = SIZES[name]
-        method = mor_bench.load_method(
-            "umesh",
-            channels=channels,
-            steps=steps,
-            iterations=iterations,
-            learning_rate=learning_rate,
-            schedule="one-cycle",
-            precision=precision,
-            inference="cuda",
-        )
-        one = Contestant(name, mor_bench.load_dataset(name, split="sample"), method)
-        print(
-            f"{name}: {len(one.data.train)} samples after {perf_counter() - begun:.0f} s",
-            flush=True,
-        )
-        contestants.append(one)
-        threads.append(Thread(target=one.fit))
-        threads[-1].start()
+    finished: SimpleQueue[Contestant] = SimpleQueue()
+    names = scenes or list(SIZES)
+    for name in names:
+        one = contestant_of(name, iterations, finished)
+        print(f"{one.name}: {len(one.data.train)} training samples", flush=True)
+        Thread(target=one.fit, daemon=True).start()
         one.started.wait()  # one recording at a time
-    for thread in threads:
-        thread.join()
-    rows = [row_of(one) for one in contestants]
-    found = {"gpu": gpu_name(), "torch": torch.__version__, "side_by_side": len(rows), "rows": rows}
+    found: dict[str, Any] = {"gpu": gpu_name(), "torch": torch.__version__, "rows": []}
+    ended = []
+    for _ in names:
+        ended.append(finished.get())
+        found["rows"].append(row_of(ended[-1]))
+        _write(report, found)
+    for one, row in zip(ended, found["rows"], strict=True):
+        if one.error is None:
+            row["latency_ms"] = latency(one)
+    _write(report, found)
+
+
+def _write(report: Path, found: dict[str, Any]) -> None:
+    row = found["rows"][-1]
+    print(row["dataset"], row.get("error") or row["test"], row.get("latency_ms"), flush=True)
     write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
-    for row in rows:
-        print(row["dataset"], row.get("error") or (row["test"], row["latency_ms"]), flush=True)
 
 
 if __name__ == "__main__":
