@@ -7,7 +7,7 @@ from math import exp
 from typing import Any
 
 from mor_bench.report.number_format import number
-from mor_bench.report.published_figures import PUBLISHED
+from mor_bench.report.published_figures import PUBLISHED, Published
 from tests.benchmarks.umesh_scaling import HELD_OUT, PAPER, fit_law
 from tests.published.run_tables import markdown
 from tests.published.stored import content_of
@@ -68,6 +68,59 @@ def network_size_law(source: str) -> str:
     names.append(name + f"paper, m, extrapolated; in the paper {_metres(PAPER_E_M)}")
     body = [list(cells) for cells in zip(names, *columns, strict=True)]
     return markdown(["", "power law", "power law above a floor"], body)
+
+
+def paper_size(source: str) -> str:
+    """Show the errors of the paper's networks, trained here, beside those of the paper."""
+    body = []
+    for row in content_of(source)["rows"]:
+        test, paper = row["test"], _published(row)
+        body.append(
+            [
+                row["dataset"],
+                f"{row['channels']}, {row['steps']}",
+                f"{row['iterations']:,}",
+                f"{row['n_train']:,}",
+                number(row["fit_s"]),
+                _beside(test["mean_dof_m"], paper.mean_m),
+                _beside(test["std_dof_m"], paper.std_m),
+                _beside(test["max_dof_m"], paper.max_m),
+                _beside(test["slope"], paper.slope),
+                " / ".join(number(100 * test[f"rel_l2_{name}"]) for name in ("median", "p95")),
+                number(100 * test["tip_rel_at_largest"]),
+            ]
+        )
+    headings = ["dataset", "c, k", "iterations", "training samples", "trained, s"]
+    headings += [f"{name}: ours / paper's" for name in ("ē, m", "σ(e), m", "largest e, m", "slope")]
+    headings += ["relative L2 error, %: median / p95", "tip at largest u, %"]
+    return markdown(headings, body)
+
+
+def paper_size_latency(source: str) -> str:
+    """Show the times of single queries of the paper's networks on a graphics processor."""
+    body = []
+    for row in content_of(source)["rows"]:
+        times = [row["latency_ms"][name] for name in ("predict", "replayed", "launched")]
+        cells = [f"{number(found['median'])}; {number(found['p95'])}" for found in times]
+        published = number(_published(row).predict_ms)
+        body.append([row["dataset"], f"{row['n_weights']:,}", *cells, published])
+    headings = ["dataset", "weights", "whole query, ms", "network, replayed, ms"]
+    return markdown([*headings, "network, launched by PyTorch, ms", "paper's query, ms"], body)
+
+
+def _published(row: dict[str, Any]) -> Published:
+    """Return the paper's figures for a scene and size; our deformation is in the name of ours."""
+    name = row["dataset"].removesuffix("-paper")
+    (found,) = [
+        paper
+        for paper in PUBLISHED
+        if (paper.dataset, paper.channels, paper.steps) == (name, row["channels"], row["steps"])
+    ]
+    return found
+
+
+def _beside(ours: float, published: float | None) -> str:
+    return f"{_metres(ours)} / {'–' if published is None else _metres(published)}"
 
 
 def _law_cells(rows: Rows, others: Rows, held_out: Rows, *, floor: bool) -> list[str]:

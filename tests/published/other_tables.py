@@ -22,7 +22,12 @@ from tests.published.cost_tables import (
     scaling,
 )
 from tests.published.literature_table import literature
-from tests.published.network_size_tables import network_size_law, network_sizes
+from tests.published.network_size_tables import (
+    network_size_law,
+    network_sizes,
+    paper_size,
+    paper_size_latency,
+)
 from tests.published.projection_tables import projections, reconstructions
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
@@ -349,6 +354,8 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "choices-decided": choices_decided,
     "network-sizes": network_sizes,
     "network-size-law": network_size_law,
+    "paper-size": paper_size,
+    "paper-size-latency": paper_size_latency,
     "paper-amplitude": paper_amplitude,
     "records": records,
     "optimism": optimism,
