@@ -12,7 +12,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import psutil
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 MEMBERSHIP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
@@ -99,6 +98,8 @@ def memory_limit_bytes(membership: Path = MEMBERSHIP, groups: Path = GROUPS) -> 
     membership, groups : Path
         Linux's list of the process's control groups, and the folder of all groups.
     """
+    import psutil  # here, because a solve needs no psutil, and its import takes 10 ms
+
     limits = [float(psutil.virtual_memory().total)]
     with suppress(OSError):
         for line in membership.read_text(encoding="utf-8").splitlines():
@@ -118,6 +119,8 @@ def memory_limit_bytes(membership: Path = MEMBERSHIP, groups: Path = GROUPS) -> 
 
 def free_memory_bytes() -> float:
     """Return the memory that is free, or the limit of this process if that is less."""
+    import psutil
+
     return min(float(psutil.virtual_memory().available), memory_limit_bytes())
 
 
@@ -128,6 +131,8 @@ def peak_memory_bytes() -> int:
         with open("/proc/self/status", encoding="ascii") as status:
             return next(int(line.split()[1]) * 1024 for line in status if line.startswith("VmHWM:"))
     except (OSError, StopIteration):
+        import psutil
+
         info = psutil.Process().memory_info()
         return int(getattr(info, "peak_wset", info.rss))
 
@@ -178,6 +183,8 @@ def describe_machine() -> dict[str, Any]:
     ``processor_model`` has family, model, stepping and vector instructions.
     ``load`` is the mean number of running processes over the last 1, 5 and 15 minutes.
     """
+    import psutil
+
     versions = {}
     for package in ("mor-bench", "numpy", "scipy", "numba", "scikit-learn", "torch"):
         try:

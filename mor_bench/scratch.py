@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import psutil
 
 PREFIX = "mor-bench"
 
@@ -41,8 +40,13 @@ def identity(pid: int) -> str | None:
             stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
             state, *fields = stat.rpartition(")")[2].split()
             return None if state in "ZX" else f"{pid}-{fields[18]}"
+    except (OSError, IndexError):
+        return None
+    import psutil  # here, because Linux does without, and its import takes 10 ms
+
+    try:
         return f"{pid}-{round(1e3 * psutil.Process(pid).create_time())}"
-    except (OSError, IndexError, psutil.Error):
+    except psutil.Error:
         return None
 
 
