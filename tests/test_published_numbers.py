@@ -18,7 +18,13 @@ from tests.published.claims import (
     without_evidence,
     wrong_numbers,
 )
-from tests.published.compact import ERRORS, wrong_conclusions, wrong_summaries, wrong_verdicts
+from tests.published.compact import (
+    ERRORS,
+    wrong_bounds,
+    wrong_conclusions,
+    wrong_summaries,
+    wrong_verdicts,
+)
 from tests.published.pictures import stale_pictures
 from tests.published.stored import REPORTS, ROOT
 from tests.verification.trust_record import git
@@ -83,6 +89,12 @@ def test_every_entry_of_the_ledger_belongs_to_a_page() -> None:
 @pytest.mark.parametrize("run", RUNS)
 def test_the_errors_of_a_run_are_those_of_its_samples(run: str) -> None:
     wrong = list(wrong_summaries(REPORTS / run))
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_the_bounds_of_single_errors_follow_from_the_samples_of_a_run(run: str) -> None:
+    wrong = list(wrong_bounds(REPORTS / run))
     assert not wrong, "\n".join(wrong)
 
 

@@ -29,12 +29,14 @@ from tests.published.compact import (
     compact,
     reword,
     verdict_again,
+    wrong_bounds,
     wrong_conclusions,
     wrong_summaries,
     wrong_verdicts,
 )
 from tests.published.literature_table import literature
 from tests.published.pictures import draw_pictures, stale_pictures
+from tests.published.run_tables import covered
 from tests.published.stored import REPORTS, EvidenceError, content_of, look_up, run_of
 from tests.synthetic import synthetic_comparison
 
@@ -148,6 +150,36 @@ def test_texts_that_agree_with_each_other_but_not_with_the_samples_are_found(
     found = list(wrong_summaries(folder))
     named = "rel_l2_median" + f" of {part}" * (part != "error")
     assert any(f"pod [n_modes=80]: {named} is" in line for line in found)
+
+
+def test_a_bound_that_the_samples_do_not_give_is_found(tmp_path: Path) -> None:
+    folder = shutil.copytree(REPORTS / "learned/named-sets", tmp_path / "copy")
+    content = json.loads((folder / "results.json").read_text())
+    linear, forces = (
+        look_up(content, f"rows/label={name}/bound") for name in ("linear-fem", "pca-regression")
+    )
+    share, bound = linear["coverage"]["test"], forces["relative_l2"]
+    linear["coverage"]["test"], forces["relative_l2"] = share - 0.001, 1.001 * bound
+    (folder / "results.json").write_text(json.dumps(content))
+    covers, differs, *_ = wrong_bounds(folder)
+    assert f"linear-fem: {share:g} of the test is covered" in covers
+    assert f"pca-regression: bound is {bound:g}, stated as {1.001 * bound:g}" in differs
+
+
+def test_the_table_of_bounds_takes_each_method_from_the_first_run_that_has_it() -> None:
+    first = covered("reports/learned/named-sets").splitlines()
+    both = covered("reports/learned/named-sets,reports/learned/others").splitlines()
+    assert both[: len(first)] == first
+    beside = [line.split("|")[2].strip() for line in both[len(first) :]]
+    others = run_of("reports/learned/others").rows
+    unseen = {row.method for row in others} - {"linear-fem", "fem"}
+    assert sorted(beside) == sorted(f"`{method}`" for method in unseen)
+    row = look_up(
+        content_of("reports/learned/named-sets/results.json"), "rows/label=pca-regression/bound"
+    )
+    (cells,) = [line.split(" | ") for line in first if "`pca-regression`" in line]
+    assert cells[4] == f"{100 * row['relative_l2']:.3g}"
+    assert cells[6].strip() == f"{100 * row['coverage']['test']:.3g}"
 
 
 def test_a_interval_that_the_samples_do_not_give_is_found(stored: Path, tmp_path: Path) -> None:

@@ -24,12 +24,16 @@ class StressErrors:
         self._stresses = CellStresses(scene)
         self._rest = self._stresses(np.zeros((1, scene.mesh.n_nodes, 3))).cauchy
 
-    def __call__(self, predicted: Array, references: Array) -> tuple[Array, Array]:
-        """Return the errors of the stress field and of the largest von Mises stress, (n,) each.
+    def __call__(self, predicted: Array, references: Array) -> tuple[Array, Array, Array]:
+        """Return the errors of the field, of its largest von Mises stress and tension, (n,) each.
 
         The first is the norm √(Σ V σ : σ) of the difference over that of the reference, with the
         cells' volumes V. The stress of a rest state under gravity is subtracted from the field,
-        since no method computes it. The largest von Mises stress contains it.
+        since no method computes it. The largest stresses contain it.
+
+        The tension is the largest principal stress, on which Rankine's criterion of rupture
+        depends. Compression everywhere makes it negative, and it may vanish. So its error is
+        divided by the largest magnitude of a principal stress of the reference.
 
         Parameters
         ----------
@@ -39,7 +43,13 @@ class StressErrors:
         own, right = self._stresses(predicted), self._stresses(references)
         field = self._norm(own.cauchy - right.cauchy), self._norm(right.cauchy - self._rest)
         peak, true_peak = own.von_mises.max(axis=1), right.von_mises.max(axis=1)
-        return _relative(*field), _relative(np.abs(peak - true_peak), true_peak)
+        tension, principal = own.principal[..., 2].max(axis=1), right.principal
+        off = np.abs(tension - principal[..., 2].max(axis=1))
+        return (
+            _relative(*field),
+            _relative(np.abs(peak - true_peak), true_peak),
+            _relative(off, np.abs(principal).max(axis=(1, 2))),
+        )
 
     def _norm(self, stress: Array) -> Array:
         squares = np.einsum("ncij,ncij->nc", stress, stress)

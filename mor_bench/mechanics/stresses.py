@@ -48,8 +48,11 @@ class Stresses:
 
     @property
     def principal(self) -> Array:
-        """Principal stresses in ascending order, Pa, (..., n_cells, 3)."""
-        return np.asarray(np.linalg.eigvalsh(self.cauchy))
+        """Principal stresses in ascending order, Pa, (..., n_cells, 3); NaN if not finite."""
+        finite = np.isfinite(self.cauchy).all(axis=(-2, -1))
+        found = np.full(self.cauchy.shape[:-1], np.nan)
+        found[finite] = np.linalg.eigvalsh(self.cauchy[finite])
+        return found
 
 
 class CellDeformations:

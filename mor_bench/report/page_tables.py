@@ -72,6 +72,9 @@ GROUPS: dict[str, dict[str, Cell]] = {
         "largest von Mises, median": figure_cell("error", "peak_stress_rel_median", percent),
         "largest von Mises, p95": figure_cell("error", "peak_stress_rel_p95", percent),
         "largest von Mises, max": figure_cell("error", "peak_stress_rel_max", percent),
+        "largest tension, median": figure_cell("error", "peak_tension_rel_median", percent),
+        "largest tension, p95": figure_cell("error", "peak_tension_rel_p95", percent),
+        "largest tension, max": figure_cell("error", "peak_tension_rel_max", percent),
     },
     "Size and samples": {
         "model": lambda e: bytes_text(e.row.model_bytes),

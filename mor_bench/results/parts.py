@@ -176,6 +176,9 @@ class ErrorSummary(Part):
         the dataset asks for stresses.
     peak_stress_rel_median, peak_stress_rel_p95, peak_stress_rel_max : float
         Error of the largest von Mises stress over that stress, as a fraction; NaN likewise.
+    peak_tension_rel_median, peak_tension_rel_p95, peak_tension_rel_max : float
+        Error of the largest principal stress over the largest magnitude of a principal stress, as a
+        fraction; NaN likewise, and in results of earlier versions.
     """
 
     mean_dof_m: Real = nan
@@ -203,3 +206,6 @@ class ErrorSummary(Part):
     peak_stress_rel_median: Real = nan
     peak_stress_rel_p95: Real = nan
     peak_stress_rel_max: Real = nan
+    peak_tension_rel_median: Real = nan
+    peak_tension_rel_p95: Real = nan
+    peak_tension_rel_max: Real = nan

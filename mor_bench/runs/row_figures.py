@@ -44,7 +44,7 @@ def n_failed(score: Score) -> int:
 def error_summary(score: Score) -> ErrorSummary:
     """Summarise the errors on a test set."""
     figures = summary(SampleErrors(**{name: score[name] for name in ERRORS}))
-    for name in ("reaction", "stress", "peak_stress"):
+    for name in ("reaction", "stress", "peak_stress", "peak_tension"):
         if f"{name}_relative" in score:
             figures |= percentiles(score[f"{name}_relative"], f"{name}_rel")
     return ErrorSummary(**figures)

@@ -189,7 +189,7 @@ class TrainingData:
         if self.reaction_errors:
             found["reaction_relative"] = self.reaction_errors(predicted, references)
         if self.stress_errors:
-            names = "stress_relative", "peak_stress_relative"
+            names = "stress_relative", "peak_stress_relative", "peak_tension_relative"
             found |= zip(names, self.stress_errors(predicted, references), strict=True)
         return found
 

@@ -26,6 +26,7 @@ from mor_bench.analysis.draws import Draws, Interval
 from mor_bench.analysis.selection import decide
 from mor_bench.analysis.selection_text import NO_RUNNER_UP, RUNNER_UP
 from mor_bench.analysis.verdict import RULE, Verdict, needs_of
+from mor_bench.measure.error_bounds import calibrated
 from mor_bench.measure.error_metrics import ERRORS as FIGURES
 from mor_bench.measure.error_metrics import SampleErrors, summary
 from mor_bench.options import FOLDERS
@@ -233,6 +234,30 @@ def wrong_summaries(folder: Path) -> Iterator[str]:
                 if not _close(value, said):
                     where = f"{row.dataset}, {row.label}: {name}" + f" of {part}" * (part in PARTS)
                     yield f"{where} is {value:g}, stated as {said:g}"
+
+
+def wrong_bounds(folder: Path) -> Iterator[str]:
+    """Calibrate the bounds of single errors again from the stored samples; yield differences.
+
+    Of the test sets, the samples of the main one are stored.
+    """
+    run = StoredRun.read(folder)
+    for row in run.rows:
+        if not row.ok or row.bound is None:
+            continue
+        samples, where = run.samples(row), f"{row.dataset}, {row.label}"
+        patches = run.dataset_arrays(row.dataset)["validation_regions"]
+        regions = patches[:, 0] if patches.shape[1] == 1 else patches
+        grouped = regions if row.bound.n_groups < row.bound.n else None
+        again = calibrated(samples["validation_relative_l2"], grouped, row.bound.level)
+        if not _close(again.relative_l2, row.bound.relative_l2):
+            yield f"{where}: bound is {again.relative_l2:g}, stated as {row.bound.relative_l2:g}"
+        least, most = (
+            float((samples["relative_l2"] <= row.bound.relative_l2 * factor).mean())
+            for factor in (1 - 1e-6, 1 + 1e-6)
+        )
+        if not least <= row.bound.coverage.get("test", least) <= most:
+            yield f"{where}: {least:g} of the test is covered, stated as {row.bound.coverage}"
 
 
 def _relative(errors: NDArray[Any]) -> dict[str, float]:

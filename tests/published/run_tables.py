@@ -239,6 +239,35 @@ def named_sets(source: str, dataset: str = "", methods: str = "") -> str:
     return markdown(["method", "is given", "configuration", *sets], body)
 
 
+def covered(source: str) -> str:
+    """Show bounds of single errors and their coverage of test sets; SOURCE is FOLDER,FOLDER,….
+
+    Each method has its configuration for the least error, from the first run that has the method.
+    The full-order model is left out.
+    """
+    found: dict[tuple[str, str], tuple[Row, str]] = {}
+    for run in map(run_of, source.split(",")):
+        for name in run.datasets:
+            bounds, given = error_bounds(run, name), given_by(run, name)
+            for method, mine in _by_method(_rows(run, name, "")).items():
+                row = chosen(mine, bounds)
+                found.setdefault((name, method), (row, class_text(row, given)))
+    names = list(
+        dict.fromkeys(s for row, _ in found.values() if row.bound for s in row.bound.coverage)
+    )
+    body = []
+    for (dataset, method), (row, told) in sorted(found.items(), key=lambda item: item[0][0]):
+        if row.bound is None or row.reference:
+            continue
+        size, shares = row.bound.relative_l2, row.bound.coverage
+        cells = [f"`{dataset}`", f"`{method}`", told, f"{row.bound.n_groups}", _percent(size)]
+        cells += [number(size / median_error(row)) if isfinite(size) else DASH]
+        body.append([*cells, *(_percent(shares[s]) if s in shares else DASH for s in names)])
+    sets = ["split's test part" if name == "test" else f"`{name}`" for name in names]
+    headings = ["dataset", "method", "is given", "regions", "bound", "bound / median", *sets]
+    return markdown(headings, body)
+
+
 def verdict(source: str, dataset: str = "") -> str:
     """State the verdict on a dataset in the words of the report."""
     run = run_of(source)
@@ -339,6 +368,7 @@ RUN_TABLES: dict[str, Callable[..., str]] = {
     "best-of-class": best_of_class,
     "fastest": fastest,
     "named-sets": named_sets,
+    "covered": covered,
     "verdict": verdict,
     "headline": headline,
     "indicated": indicated,

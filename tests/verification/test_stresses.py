@@ -152,13 +152,37 @@ def test_errors_of_the_field_and_of_the_largest_stress() -> None:
     bad = u.copy()
     bad[1] = np.nan
     errors = StressErrors(scene)
-    assert [part.tolist() for part in errors(u, u)] == [[0.0, 0.0], [0.0, 0.0]]
-    field, peak = errors(1.1 * u, u)
+    assert [part.tolist() for part in errors(u, u)] == [[0.0, 0.0]] * 3
+    field, peak, tension = errors(1.1 * u, u)
     assert ((field > 0.05) & (field < 0.3)).all()
     assert ((peak > 0.03) & (peak < 0.3)).all()
-    assert [part[1] for part in errors(bad, u)] == [np.inf, np.inf]
+    assert ((tension > 0.0) & (tension < 0.3)).all()
+    assert [part[1] for part in errors(bad, u)] == [np.inf] * 3
     # No answer at all has the whole stress beyond the rest state as its error.
     np.testing.assert_allclose(errors(np.zeros_like(u), u)[0], 1.0, rtol=1e-12)
+
+
+def test_the_error_of_the_tension_is_that_of_eigenvalues_also_where_all_is_compressed() -> None:
+    scene = block("neo-hookean", {})
+    strains = [np.diag([0.2, 0.0, -0.1]), -0.1 * np.eye(3)]
+    u = np.stack([scene.mesh.points @ strain for strain in strains])
+    predicted = 1.2 * u
+    tension, size = np.empty((2, 2)), np.empty(2)
+    for i in range(2):
+        for j, displacement in enumerate((predicted[i], u[i])):
+            cauchy = mor_bench.stresses(scene, displacement).cauchy
+            eigenvalues = np.linalg.eigvals(cauchy).real
+            tension[i, j], size[i] = eigenvalues.max(), np.abs(eigenvalues).max()
+    assert tension[0].min() > 0 > tension[1].max()
+    expected = np.abs(tension[:, 0] - tension[:, 1]) / size
+    np.testing.assert_allclose(StressErrors(scene)(predicted, u)[2], expected, rtol=1e-9)
+
+
+def test_an_inverted_cell_does_not_hide_the_principal_stresses_of_the_others() -> None:
+    tensors = np.stack([np.diag([1.0, 3.0, 2.0]), np.full((3, 3), np.inf), np.full((3, 3), np.nan)])
+    found = Stresses(tensors).principal
+    assert found[0].tolist() == [1.0, 2.0, 3.0]
+    assert np.isnan(found[1:]).all()
 
 
 def test_stresses_refuse_what_has_none() -> None:
@@ -190,5 +214,6 @@ def test_a_run_gives_the_errors_of_the_stress(tmp_path: Path, cache: Path) -> No
     assert linear
     assert exact.stress_rel_max < 1e-6 < linear.stress_rel_median < linear.stress_rel_max
     assert exact.peak_stress_rel_max < 1e-6 < linear.peak_stress_rel_median
+    assert exact.peak_tension_rel_max < 1e-6 < linear.peak_tension_rel_median
     titles = [table.title for table in figure_tables(entries_of(made, "wanted"))]
     assert "Stress at the cells' centroids (%)" in titles
