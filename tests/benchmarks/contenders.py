@@ -25,6 +25,7 @@ from mor_bench.machine import describe_machine
 from mor_bench.options import CommandLine, Options
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.scene import Scene
+from tests.benchmarks.instructions import AVX2
 
 Array = NDArray[np.float64]
 
@@ -135,9 +136,12 @@ def timed(contender: Contender, forces: Array) -> tuple[float, int]:
         gc.enable()
 
 
-def pin_threads(module: str, threads: int) -> None:
-    """Start the running module anew with this many threads in every library, unless it has been."""
-    pinned = dict.fromkeys(THREAD_VARIABLES, str(threads))
+def pin_threads(module: str, threads: int, *, avx2: bool = False) -> None:
+    """Start the running module anew with this many threads in every library, unless it has been.
+
+    With `avx2`, the libraries are held to AVX2 too.
+    """
+    pinned = dict.fromkeys(THREAD_VARIABLES, str(threads)) | (AVX2 if avx2 else {})
     if any(
         os.environ.get(name) != value for name, value in pinned.items()
     ):  # libraries read them when they are loaded
@@ -152,6 +156,7 @@ class TimingOptions(Options):
     loads: Annotated[int, Field(ge=1, description="Loads of each dataset.")] = 5
     rounds: Annotated[int, Field(ge=1, description="Solves of each load.")] = 3
     threads: Annotated[int, Field(ge=1, description="Threads of every contender.")] = 1
+    avx2: Annotated[bool, Field(description="Hold all libraries to AVX2.")] = False
     report: Annotated[
         Path | None,
         Field(description="Also write everything to this file."),
@@ -161,7 +166,12 @@ class TimingOptions(Options):
     def write(self, content: dict[str, Any]) -> None:
         """Write the report, if it is wanted."""
         if self.report is not None:
-            whole = {"machine": describe_machine(), "threads": self.threads, **content}
+            whole = {
+                "machine": describe_machine(),
+                "threads": self.threads,
+                "avx2_only": self.avx2,
+                **content,
+            }
             self.report.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
 
 

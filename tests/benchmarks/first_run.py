@@ -22,16 +22,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-ROOT = Path(__file__).parents[2]
+from tests.benchmarks.instructions import AVX2
 
-AVX2 = {
-    "ONEDNN_MAX_CPU_ISA": "AVX2",
-    "ATEN_CPU_CAPABILITY": "avx2",
-    "NUMBA_CPU_NAME": "haswell",
-    "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
-    "OPENBLAS_CORETYPE": "Haswell",
-}
-"""Environment in which oneDNN, PyTorch, Numba, NumPy and OpenBLAS use AVX2 at most."""
+ROOT = Path(__file__).parents[2]
 
 RUN = r"""
 import io, json, re, sys, time

@@ -324,7 +324,7 @@ def main(
     options: TimingOptions,
 ) -> None:
     """Time the full-order model beside other finite-element codes."""
-    pin_threads("tests.benchmarks.peers", options.threads)
+    pin_threads("tests.benchmarks.peers", options.threads, avx2=options.avx2)
     console = Console()
     entries = installed_entries(console, solver or OWN_SOLVERS)
     if peer is not None:

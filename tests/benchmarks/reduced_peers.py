@@ -333,7 +333,7 @@ def main(
     options: TimingOptions,
 ) -> None:
     """Time reduced-order models beside those of Kratos."""
-    pin_threads("tests.benchmarks.reduced_peers", options.threads)
+    pin_threads("tests.benchmarks.reduced_peers", options.threads, avx2=options.avx2)
     console = Console()
     data = mor_bench.load_dataset(dataset, limit=2 * train)
     if len(data.train) < train or len(data.test) < options.loads:
