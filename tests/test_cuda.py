@@ -18,7 +18,10 @@ from mor_bench.learning import training, training_loop  # noqa: E402 - torch is 
 from mor_bench.learning.inference import Inference  # noqa: E402
 from mor_bench.surrogates.umesh.network import new_network  # noqa: E402
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+]
 
 TINY = {"channels": 8, "steps": 1, "iterations": 60, "batch_size": 8, "learning_rate": 1e-3}
 ROUNDING = 2e-2
