@@ -115,5 +115,6 @@ def interpreted(module: Any) -> dict[str, Any]:
     }
     exec(compile(source, module.__file__, "exec"), names)
     names["_log"] = lambda x: x._times(math.log(x.value))
+    names["_inverse_cube_root"] = lambda x: x._times(x.value ** (-1 / 3))
     names["_exp"] = lambda x: x._times(math.exp(x.value))
     return names

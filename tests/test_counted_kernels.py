@@ -42,7 +42,8 @@ def law_kernel(name: str, *constants: int) -> Callable[..., Any]:
 
 def one_cell(n_points: int, n_nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return displacements (3 n_nodes + 1,), gradients (1, n_points, n_nodes, 3) and weights."""
-    rng = np.random.default_rng({10: 1}.get(n_nodes, 0))  # fibres are in tension
+    seeds = {(1, 10): 1, (4, 10): 20}
+    rng = np.random.default_rng(seeds.get((n_points, n_nodes), 0))  # fibres are in tension
     gradients = 0.3 * rng.normal(size=(1, n_points, n_nodes, 3))
     return (
         counted_array(0.02 * rng.normal(size=3 * n_nodes + 1)),
@@ -56,7 +57,7 @@ def test_the_vectorised_kernel_does_the_declared_number_of_multiplications() -> 
     u, gradients, w = one_cell(8, 8)
     arguments = (
         u,
-        np.arange(24).reshape(1, 24, 1),
+        3 * np.arange(8).reshape(1, 8, 1),
         gradients.reshape(1, 8, 24),
         w[:, :, None],
         w[:, :, None],
@@ -86,22 +87,29 @@ LAWS = {
 }
 
 
-@pytest.mark.parametrize("n_nodes", [4, 8, 10])
+@pytest.mark.parametrize(
+    ("n_nodes", "n_points", "is_straight"),
+    [(4, 1, True), (8, 1, False), (10, 1, False), (10, 4, True)],
+)
 @pytest.mark.parametrize("name", LAWS)
 def test_the_general_kernel_does_the_declared_number_of_multiplications(
-    name: str, n_nodes: int
+    name: str, n_nodes: int, n_points: int, is_straight: bool
 ) -> None:
     law, parameters = LAWS[name]
-    kernel = law_kernel("general_force", law, n_nodes)
-    u, gradients, weights = one_cell(1, n_nodes)
+    kernel = law_kernel("general_force", law, n_nodes, is_straight)
+    u, gradients, weights = one_cell(n_points, n_nodes)
     n_upper = 3 * n_nodes * (3 * n_nodes + 1) // 2
-    slots, dofs = np.arange(n_upper)[None, :, None], np.arange(3 * n_nodes)[None, :, None]
-    flat = gradients.reshape(1, 1, 3 * n_nodes)
-    given = (u, dofs, flat, weights[:, :, None], counted_array([parameters]))
+    slots, dofs = np.arange(n_upper)[None, :, None], 3 * np.arange(n_nodes)[None, :, None]
+    flat = gradients.reshape(1, n_points, 3 * n_nodes)
+    if is_straight:
+        flat = flat[:, :1, :9]
+    given = (u, dofs, flat, weights[:, :, None], counted_array([parameters] * n_points))
     force = zeros(3 * n_nodes + 1)
     alone = multiply_adds(kernel, *given, None, force, None)
     both = multiply_adds(kernel, *given, slots, force, zeros(n_upper + 1))
-    assert (alone, both) == laws.general_multiply_adds(law, len(parameters), n_nodes)
+    assert (alone, both) == laws.general_multiply_adds(
+        law, len(parameters), n_nodes, n_points, is_straight
+    )
 
 
 def test_a_sweep_takes_the_declared_number_of_multiplications() -> None:

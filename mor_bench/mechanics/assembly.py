@@ -17,7 +17,7 @@ from mor_bench.mechanics.discretisation import (
     law_parameters,
     quadrature_of,
 )
-from mor_bench.mechanics.elements import H8
+from mor_bench.mechanics.elements import H8, T4, is_straight, shape_gradients
 from mor_bench.mechanics.kernels import (
     ADVANCE_MULTIPLY_ADDS,
     FORCE_MULTIPLY_ADDS,
@@ -38,7 +38,7 @@ from mor_bench.scene.supports import Frames
 
 Array = NDArray[np.float64]
 
-Batches = tuple[Array, Array, Array, NDArray[np.int32]]
+Batches = tuple[Array, Array, Array, NDArray[np.uint32]]
 """Gradients, two arrays of the kernel of the law, and slots of batches of cells."""
 
 PARALLEL_FROM = 512
@@ -62,6 +62,21 @@ def _batched(values: NDArray[Any], fill: float) -> NDArray[Any]:
     return np.ascontiguousarray(
         np.moveaxis(padded.reshape(n_batches, LANES, *values.shape[1:]), 1, -1)
     )
+
+
+def _triples(
+    dof_of_node: NDArray[np.int64], n: int
+) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+    """Return where each node's three displacements start in the vectors of the kernels.
+
+    These vectors end in three zeros, for fixed nodes. Then follow copies of the entries of nodes
+    whose dofs are not neighbours, as where only some components are fixed; also return their dofs.
+    """
+    starts = dof_of_node[:, 0].copy()
+    fixed = (dof_of_node == n).all(axis=1)
+    copied = ~fixed & (np.diff(dof_of_node, axis=1) != 1).any(axis=1)
+    starts[copied] = n + 3 + 3 * np.arange(copied.sum())
+    return starts.astype(np.uint32), dof_of_node[copied].ravel()
 
 
 def _placed(
@@ -121,7 +136,6 @@ class Assembler:
         frames: Frames | None = None,
     ) -> None:
         quadrature = quadrature_of(body)  # checks the cells
-        n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
         self.pattern, slots = build_pattern(dof_of_node, body.cells, n_dofs)
         self.n_dofs = n_dofs
         # The kernels sum over dofs along x, y and z, which nodes with frames have beside their own.
@@ -133,17 +147,23 @@ class Assembler:
             dof_of_node, self._n_summed = self.turned.dof_of_node, self.turned.n
             self.summed_pattern, slots = build_pattern(dof_of_node, body.cells, self._n_summed)
             self.turned.of_patterns(self.summed_pattern, self.pattern)
-        dofs = dof_of_node[body.cells].reshape(n_cells, 3 * n_nodes)
-        self.n_cells = n_cells
+        self.n_cells = len(body.cells)
         self._n_values = len(self.summed_pattern.indices) + 1
         self._dof_of_node, self._own, self._frames = dof_of_node, own, frames
-        self._dofs = _batched(dofs.astype(np.int32), self._n_summed)
-        self._slots = _batched(slots, len(self.summed_pattern.indices))
+        starts, self._copied = _triples(dof_of_node, self._n_summed)
+        self._n_padded = self._n_summed + 3 + len(self._copied)
+        self._dofs = _batched(starts[body.cells], self._n_summed)
+        self._slots = _batched(slots.astype(np.uint32), len(self.summed_pattern.indices))
         self._slabs: Slabs | None = None
         if len(self._dofs) >= PARALLEL_FROM:
             self._slabs = slabs_of(len(self._dofs), self._touched)
-        gradients = distinct(quadrature.gradients.reshape(n_cells, n_points, 3 * n_nodes), LANES)
-        self._gradients = _batched(gradients, 0.0).reshape(-1, n_points, 3 * n_nodes * LANES)
+        self._is_straight = is_straight(body.points, body.cells)
+        gradients = quadrature.gradients
+        if self._is_straight:
+            corners = body.cells[:, : T4.n_nodes]
+            gradients = shape_gradients(body.points, corners, T4.derivatives)[0][:, :, 1:]
+        batches = _batched(distinct(gradients, LANES), 0.0)
+        self._gradients = batches.reshape(*batches.shape[:2], -1)
         self._rule = quadrature.weights
         if cell_weights is not None:
             self._rule = quadrature.weights * cell_weights[:, None]
@@ -177,15 +197,22 @@ class Assembler:
         if self._has_own_kernel:
             self._w_lam = _batched(weights * parameters[:, 0], 0.0)
             self._w_mu = _batched(weights * parameters[:, 1], 0.0)
-            per_point = FORCE_MULTIPLY_ADDS, FORCE_MULTIPLY_ADDS + TANGENT_MULTIPLY_ADDS
+            by_force = n_points * FORCE_MULTIPLY_ADDS
+            per_cell = by_force, by_force + n_points * TANGENT_MULTIPLY_ADDS
         else:
-            self._kernel = general_force(material.law, n_nodes)
+            self._kernel = general_force(material.law, n_nodes, self._is_straight)
             self._weights = _batched(weights, 0.0)
             self._parameters = np.repeat(parameters, LANES, axis=1)
-            per_point = general_multiply_adds(material.law, parameters.shape[1], n_nodes)
+            shape = n_nodes, n_points, self._is_straight
+            per_cell = general_multiply_adds(material.law, parameters.shape[1], *shape)
         self._batches = self._chosen(slice(None))
-        self._multiply_adds = n_cells * n_points * per_point[0], n_cells * n_points * per_point[1]
-        self._plain = body.springs is None and body.rest is None and self._frames is None
+        self._multiply_adds = n_cells * per_cell[0], n_cells * per_cell[1]
+        self._plain = (
+            body.springs is None
+            and body.rest is None
+            and self._frames is None
+            and not len(self._copied)
+        )
         self._springs: tuple[sp.csr_array, NDArray[np.int64], Array] | None = None
         if body.springs is not None:
             own = self._dof_of_node.ravel()
@@ -197,13 +224,25 @@ class Assembler:
             rest[self._own] = body.rest
             if frames is not None:
                 rest[self._own] = frames.to_local(body.rest.ravel()).reshape(-1, 3)
-            rest[self.n_dofs] = 0.0
             self._rest = self._total(rest[:-1]), self.force(rest[:-1]).force
 
     def _total(self, u: Array) -> Array:
-        """Return total displacements along x, y and z, with a zero for the supports."""
-        padded = np.append(u if self.turned is None else self.turned.spread(u), 0.0)
+        """Return total displacements along x, y and z, as the kernels read them."""
+        padded = np.zeros(self._n_padded)
+        padded[: self._n_summed] = u if self.turned is None else self.turned.spread(u)
+        self._copy(padded)
         return padded if self._rest is None else padded + self._rest[0]
+
+    def _copy(self, padded: Array) -> None:
+        """Copy displacements to where the kernels read them."""
+        if len(self._copied):
+            padded[self._n_summed + 3 :] = padded[self._copied]
+
+    def _collect(self, force: Array) -> None:
+        """Move forces at copies of displacements to their own dofs."""
+        if len(self._copied):
+            force[self._copied] += force[self._n_summed + 3 :]
+        force[self._n_summed :] = 0.0
 
     def _from_rest(self, u: Array, force: Array, energy: float, min_det_f: float) -> State:
         """Return the state without the force of the pre-load, whose work is stored energy."""
@@ -213,7 +252,7 @@ class Assembler:
         return State(force - held, energy - float(held @ u), min_det_f)
 
     def _sum(
-        self, u: Array, dofs: NDArray[np.int32], force: Array, values: Array
+        self, u: Array, dofs: NDArray[np.uint32], force: Array, values: Array
     ) -> tuple[float, float]:
         """Add forces and, where ``values`` is not empty, tangents; return energy and min det F."""
         if is_counting():
@@ -244,7 +283,7 @@ class Assembler:
         return gradients, self._weights[chosen], self._parameters, self._slots[chosen]
 
     def _sum_of(
-        self, u: Array, dofs: NDArray[np.int32], batches: Batches, force: Array, values: Array
+        self, u: Array, dofs: NDArray[np.uint32], batches: Batches, force: Array, values: Array
     ) -> tuple[float, float]:
         """Add forces and tangents of batches of cells; return energy and min det F."""
         gradients, second, third, slots = batches
@@ -259,39 +298,45 @@ class Assembler:
             out = internal_force_and_tangent(u, dofs, *cells, slots, force, values)
         return out
 
-    def _touched(self, first: int, last: int) -> NDArray[np.int32]:
-        """Return the dofs of some batches of cells."""
+    def _touched(self, first: int, last: int) -> NDArray[np.uint32]:
+        """Return the first dofs of the nodes of some batches of cells."""
         dofs = self._dofs[first:last]
-        return np.asarray(dofs[dofs < self._n_summed])
+        return np.asarray(dofs[dofs != self._n_summed])
 
     def _sum_all(self, total: Array, force: Array, values: Array) -> tuple[float, float]:
         """Add forces and tangents of cells and springs; return energy and min det F."""
         energy, min_det_f = self._sum(total, self._dofs, force, values)
+        self._collect(force)
         if self._springs is None:
             return energy, min_det_f
         matrix, slots, entries = self._springs
-        own = matrix @ total[:-1]
+        moved = total[: self._n_summed]
+        own = matrix @ moved
         count(multiply_adds=matrix.nnz)
-        force[:-1] += own
+        force[: self._n_summed] += own
         if len(values):
             values[slots] += entries
-        return energy + 0.5 * float(own @ total[:-1]), min_det_f
+        return energy + 0.5 * float(own @ moved), min_det_f
 
     def force(self, u: Array) -> State:
         """Return the state at displacements ``u`` (n_dofs,), m."""
-        force = np.zeros(self._n_summed + 1)
-        if self._plain:  # three calls fewer
-            return State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, np.zeros(0)))
+        force = np.zeros(self._n_padded)
+        if self._plain:  # four calls fewer
+            padded = np.zeros(self._n_padded)
+            padded[: self.n_dofs] = u
+            found = self._sum(padded, self._dofs, force, np.zeros(0))
+            return State(force[: self.n_dofs], *found)
         found = self._sum_all(self._total(u), force, np.zeros(0))
         return self._from_rest(u, self._at_unknowns(force), *found)
 
     def _at_unknowns(self, force: Array) -> Array:
-        """Return the forces at the unknowns, of forces at the kernels' dofs and a last entry."""
-        return force[:-1] if self.turned is None else self.turned.gather(force[:-1])
+        """Return the forces at the unknowns, of forces in a vector of the kernels."""
+        own = force[: self._n_summed]
+        return own if self.turned is None else self.turned.gather(own)
 
     def force_and_tangent(self, u: Array) -> tuple[State, Array]:
         """Return the state and the values of the tangent stiffness, N/m, in ``pattern``."""
-        force, values = np.zeros(self._n_summed + 1), np.zeros(self._n_values)
+        force, values = np.zeros(self._n_padded), np.zeros(self._n_values)
         found = self._sum_all(self._total(u), force, values)
         state = self._from_rest(u, self._at_unknowns(force), *found)
         return state, values[:-1] if self.turned is None else self.turned.tangent(values[:-1])
@@ -304,14 +349,16 @@ class Assembler:
         own = self._cell_forces(self._total(u))
         if self._rest is not None:
             own = own - self._cell_forces(self._rest[0])
-        forces = np.moveaxis(own, 2, 1).reshape(-1, self._dofs.shape[1])[: self.n_cells]
+        forces = own.swapaxes(1, 2).reshape(-1, 3 * self._dofs.shape[1])[: self.n_cells]
         return forces if self.turned is None else self.turned.cell_forces(forces, self._cells)
 
     def _cell_forces(self, total: Array) -> Array:
-        local = np.arange(self._dofs.size, dtype=np.int32).reshape(self._dofs.shape)
-        force = np.zeros(local.size + 1)
-        self._sum(np.append(total[self._dofs].ravel(), 0.0), local, force, np.zeros(0))
-        return force[:-1].reshape(self._dofs.shape)
+        """Return forces (n_batches, n_nodes, LANES, 3) of total displacements."""
+        local = 3 * np.arange(self._dofs.size, dtype=np.uint32).reshape(self._dofs.shape)
+        force = np.zeros(3 * local.size)
+        own = total[self._dofs[..., None] + np.arange(3)].ravel()
+        self._sum(own, local, force, np.zeros(0))
+        return force.reshape(*local.shape, 3)
 
     def relax(
         self, u: Array, load: Array, mass: Array, control: Array, n_steps: int
@@ -324,7 +371,7 @@ class Assembler:
         padded, v, before = self._total(u), np.zeros(self.n_dofs), np.zeros(self.n_dofs)
         load = load if self._rest is None else load + self._rest[1]
         done, status, min_det = 0, RUNNING, np.inf
-        if self._has_own_kernel and self._springs is None:
+        if self._has_own_kernel and self._springs is None and not len(self._copied):
             cells = self._dofs, self._gradients, self._w_lam, self._w_mu
             done, status, min_det = relax(padded, v, before, load, mass, control, n_steps, *cells)
             count(
@@ -332,11 +379,12 @@ class Assembler:
                 multiply_adds=done * self._multiply_adds[0],
             )
         else:
-            force, none = np.zeros(self.n_dofs + 1), np.zeros(0)
+            force, none = np.zeros(self._n_padded), np.zeros(0)
             while done < n_steps and status == RUNNING:
+                self._copy(padded)
                 min_det = self._sum_all(padded, force, none)[1]
                 status = advance(padded, v, force, before, load, mass, control)
                 done += 1
         count(multiply_adds=done * ADVANCE_MULTIPLY_ADDS * self.n_dofs)
-        u[:] = (padded if self._rest is None else padded - self._rest[0])[:-1]
+        u[:] = (padded if self._rest is None else padded - self._rest[0])[: self.n_dofs]
         return done, status, min_det

@@ -9,9 +9,13 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.interpolation import quadratic, trilinear
-from mor_bench.scene.mesh import HEX_CORNERS
+from mor_bench.scene.mesh import HEX_CORNERS, TET_EDGES
 
 Array = NDArray[np.float64]
+
+
+ROUND_OFF = 1e-14
+"""Distance of a node from the middle of its edge by round-off, relative to the extent of a mesh."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,15 @@ def element_of(cells: NDArray[np.int64]) -> Element:
         "cells must have shape (n_cells, 8) for H8, (n_cells, 4) for T4 or (n_cells, 10) for T10; "
         f"got {cells.shape}."
     )
+
+
+def is_straight(points: Array, cells: NDArray[np.int64]) -> bool:
+    """Return whether all cells are tetrahedra with straight edges and nodes in their middles."""
+    if cells.shape[1] not in (T4.n_nodes, T10.n_nodes):
+        return False
+    middles = points[cells[:, TET_EDGES]].mean(axis=2)[:, : cells.shape[1] - 4]
+    off = np.abs(points[cells[:, 4:]] - middles[:, : cells.shape[1] - 4])
+    return bool(off.max(initial=0.0) <= ROUND_OFF * np.ptp(points, axis=0).max())
 
 
 def shape_gradients(

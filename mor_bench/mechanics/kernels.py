@@ -39,6 +39,30 @@ TANGENT_MULTIPLY_ADDS = 1200
 
 
 @njit(inline="always")
+def _gather(u, dofs, u_e):
+    """Copy the displacements of the nodes of a batch; numba tests signed indices for < 0."""
+    for a in range(8):
+        for l in range(LANES):
+            d, o = np.uint64(dofs[a, l]), 3 * a * LANES + l
+            u_e[o], u_e[o + LANES], u_e[o + 2 * LANES] = (
+                u[d],
+                u[d + np.uint64(1)],
+                u[d + np.uint64(2)],
+            )
+
+
+@njit(inline="always")
+def _scatter(f_e, dofs, force):
+    """Add the forces at the nodes of a batch to ``force``."""
+    for a in range(8):
+        for l in range(LANES):
+            d, o = np.uint64(dofs[a, l]), 3 * a * LANES + l
+            force[d] += f_e[o]
+            force[d + np.uint64(1)] += f_e[o + LANES]
+            force[d + np.uint64(2)] += f_e[o + 2 * LANES]
+
+
+@njit(inline="always")
 def _component(u_e, g, i, j, l):
     """Return H_ij = Σ_a u_a,i g_a,j."""
     return (
@@ -175,16 +199,9 @@ def _add_blocks(g, h, h_lam, h_mu, t, M, k_e):
         x, y, z = 3 * a, 3 * a + 1, 3 * a + 2
         block = k_e[p * LANES : (p + 6) * LANES]
         for l in range(LANES):
-            gg = (
-                g[x * LANES + l] * g[x * LANES + l]
-                + g[y * LANES + l] * g[y * LANES + l]
-                + g[z * LANES + l] * g[z * LANES + l]
-            )
-            s = (
-                g[x * LANES + l] * t[x * LANES + l]
-                + g[y * LANES + l] * t[y * LANES + l]
-                + g[z * LANES + l] * t[z * LANES + l]
-            )
+            g0, g1, g2 = g[x * LANES + l], g[y * LANES + l], g[z * LANES + l]
+            gg = g0 * g0 + g1 * g1 + g2 * g2
+            s = g0 * t[x * LANES + l] + g1 * t[y * LANES + l] + g2 * t[z * LANES + l]
             b0 = h_lam[x * LANES + l] + h_mu[x * LANES + l]
             b1 = h_lam[y * LANES + l] + h_mu[y * LANES + l]
             b2 = h_lam[z * LANES + l] + h_mu[z * LANES + l]
@@ -199,16 +216,9 @@ def _add_blocks(g, h, h_lam, h_mu, t, M, k_e):
             u, v, q = 3 * b, 3 * b + 1, 3 * b + 2
             block = k_e[p * LANES : (p + 9) * LANES]
             for l in range(LANES):
-                gg = (
-                    g[x * LANES + l] * g[u * LANES + l]
-                    + g[y * LANES + l] * g[v * LANES + l]
-                    + g[z * LANES + l] * g[q * LANES + l]
-                )
-                s = (
-                    g[u * LANES + l] * t[x * LANES + l]
-                    + g[v * LANES + l] * t[y * LANES + l]
-                    + g[q * LANES + l] * t[z * LANES + l]
-                )
+                g0, g1, g2 = g[u * LANES + l], g[v * LANES + l], g[q * LANES + l]
+                gg = g[x * LANES + l] * g0 + g[y * LANES + l] * g1 + g[z * LANES + l] * g2
+                s = g0 * t[x * LANES + l] + g1 * t[y * LANES + l] + g2 * t[z * LANES + l]
                 m00, m11, m22 = gg * M[l] + s, gg * M[1 * LANES + l] + s, gg * M[2 * LANES + l] + s
                 m01, m02, m12 = gg * M[3 * LANES + l], gg * M[4 * LANES + l], gg * M[5 * LANES + l]
                 l0, l1, l2 = h_lam[x * LANES + l], h_lam[y * LANES + l], h_lam[z * LANES + l]
@@ -232,17 +242,18 @@ def internal_force(u, dofs, gradients, w_lam, w_mu, force):
 
     Parameters
     ----------
-    u : (n_dofs + 1,) float64
-        Displacements, m; the last entry, of the dummy dof, is zero.
-    dofs : (n_batches, 24, LANES) int32
+    u : (n,) float64
+        Displacements, m. Fixed nodes and padding read zeros behind the unknowns.
+    dofs : (n_batches, 8, LANES) uint32
+        First of the three entries of each node in ``u`` and ``force``.
     gradients : (n, n_points, 24 * LANES) float64
         dN_a/dX_j at the Gauss points, entry (3a + j) * LANES + lane, 1/m. Batch b has those of
         b mod n.
     w_lam, w_mu : (n_batches, n_points, LANES) float64
         Gauss weight times det J (and a cubature weight) times λ and times μ, J. With selective
         integration a point carries only one of the two.
-    force : (n_dofs + 1,) float64
-        Receives the sum, N; the dummy entry receives the forces of the padding.
+    force : (n,) float64
+        Receives the sum, N.
 
     Returns
     -------
@@ -254,15 +265,11 @@ def internal_force(u, dofs, gradients, w_lam, w_mu, force):
     energy, min_det = np.zeros(LANES), np.full(LANES, np.inf)
     for b in range(dofs.shape[0]):
         own = gradients[b % gradients.shape[0]]
-        for i in range(24):
-            for l in range(LANES):
-                u_e[i * LANES + l] = u[dofs[b, i, l]]
+        _gather(u, dofs[b], u_e)
         f_e[:] = 0.0
         for q in range(gradients.shape[1]):
             _point(u_e, own[q], w_lam[b, q], w_mu[b, q], H, S, f_e, energy, min_det)
-        for i in range(24):
-            for l in range(LANES):
-                force[dofs[b, i, l]] += f_e[i * LANES + l]
+        _scatter(f_e, dofs[b], force)
     return energy.sum(), min_det.min()
 
 
@@ -285,9 +292,7 @@ def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, va
     energy, min_det = np.zeros(LANES), np.full(LANES, np.inf)
     for b in range(dofs.shape[0]):
         own = gradients[b % gradients.shape[0]]
-        for i in range(24):
-            for l in range(LANES):
-                u_e[i * LANES + l] = u[dofs[b, i, l]]
+        _gather(u, dofs[b], u_e)
         f_e[:] = 0.0
         k_e[:] = 0.0
         for q in range(gradients.shape[1]):
@@ -295,9 +300,7 @@ def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, va
             _point(u_e, g, w_lam[b, q], w_mu[b, q], H, S, f_e, energy, min_det)
             _push_forward(H, S, g, w_lam[b, q], w_mu[b, q], h, h_lam, h_mu, t, M)
             _add_blocks(g, h, h_lam, h_mu, t, M, k_e)
-        for i in range(24):
-            for l in range(LANES):
-                force[dofs[b, i, l]] += f_e[i * LANES + l]
+        _scatter(f_e, dofs[b], force)
         for p in range(N_UPPER):
             for l in range(LANES):
                 values[slots[b, p, l]] += k_e[p * LANES + l]
@@ -334,11 +337,11 @@ def advance(u, v, force, before, load, mass, control):
 
     Parameters
     ----------
-    u : (n_dofs + 1,) float64
-        Displacements, m; the last entry stays zero.
+    u : (n,) float64
+        Displacements, m; entries behind the unknowns do not change.
     v : (n_dofs,) float64
         The last step, m.
-    force : (n_dofs + 1,) float64
+    force : (n,) float64
         Internal force at u, N; set to zero for the next step.
     before : (n_dofs,) float64
         Internal force before the last step, N.
@@ -373,7 +376,7 @@ def advance(u, v, force, before, load, mass, control):
         u[i] += v[i]
         before[i] = force[i]
         force[i] = 0.0
-    force[len(load)] = 0.0
+    force[len(load) :] = 0.0
     return RUNNING
 
 

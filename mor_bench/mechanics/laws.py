@@ -14,6 +14,9 @@ in D. LLVM vectorises a loop only if it uses few arrays, so those belong togethe
 write the function, give it a number, call it in the two kernels, and write a parameter class in
 `mor_bench.scene.materials`.
 
+Straight tetrahedra need the gradients of their barycentric coordinates only: du/dX = Σ_i c_i ⊗ grad
+λ_i, where c_i is the displacement of a corner of T4, and for T10 that of `_corner_displacements`.
+
 Tangent block of nodes a and b: K_ab = w g_a · A · g_b, with A = dP/dF. Saint Venant-Kirchhoff on
 H8 has a kernel of its own, which uses the structure of that law.
 
@@ -36,6 +39,9 @@ HOLZAPFEL_GASSER_OGDEN = 6
 
 LANES = 32
 """Elements or points per batch."""
+
+THIRD = 1.0 / 3.0
+"""Factor instead of a division, which takes several times as long."""
 
 SWEEPS = 6
 """Largest number of Jacobi sweeps; 3 x 3 matrices need at most 5 for all digits."""
@@ -62,6 +68,7 @@ def _from_bits(typing_context, bits):
 
 _ROOT_HALF, _BIAS = np.uint64(0x3FE6A09E667F3BCD), np.uint64(1023)
 _MANTISSA, _INTEGER = np.uint64(52), np.uint64(0x4330000000000000)
+_HALF = np.uint64(32)
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -103,11 +110,27 @@ def _exp(x):
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _inverse(E, l):
-    """Return the six components of C⁻¹ = (I + 2E)⁻¹, with det C = J²."""
+def _inverse_cube_root(x):
+    """Return x^(-1/3) of a normal x > 0, below 2 ulp, without the divisions of `_exp` and `_log`.
+
+    The first guess divides the exponent by three, in the upper half of the bits (error 3 %). Each
+    of two steps takes four terms of the series of (1 - z)^(-1/3).
+    """
+    bits = _bits(x)  # type: ignore[call-arg, var-annotated]
+    upper = _from_bits((bits >> _HALF) | _INTEGER) - 4503599627370496.0
+    guess = (4503599627370496.0 + 1430186360.0) - THIRD * upper
+    y = _from_bits(_bits(guess) << _HALF)
+    z = 1.0 - x * (y * y * y)
+    y += y * z * (THIRD + z * (2.0 / 9.0 + z * (14.0 / 81.0)))
+    z = 1.0 - x * (y * y * y)
+    return y + y * z * (THIRD + z * (2.0 / 9.0 + z * (14.0 / 81.0)))
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _inverse(E, k, l):
+    """Return the six components of C⁻¹ = (I + 2E)⁻¹, with k = 1 / det C = 1 / J²."""
     a, b, c = 1.0 + 2.0 * E[l], 1.0 + 2.0 * E[LANES + l], 1.0 + 2.0 * E[2 * LANES + l]
     d, e, f = 2.0 * E[3 * LANES + l], 2.0 * E[4 * LANES + l], 2.0 * E[5 * LANES + l]
-    k = 1.0 / (E[6 * LANES + l] * E[6 * LANES + l])
     return (
         k * (b * c - f * f),
         k * (a * c - e * e),
@@ -226,7 +249,7 @@ def _neo_hookean(E, p, S, D):
     L = LANES
     for l in range(LANES):
         lam, mu, J = p[l], p[L + l], E[6 * L + l]
-        inverse = _inverse(E, l)
+        inverse = _inverse(E, 1.0 / (J * J), l)
         i0, i1, i2, i3, i4, i5 = inverse
         log_j = _log(J)
         s = lam * log_j - mu
@@ -256,9 +279,11 @@ def _mooney_rivlin(E, p, S, D):
             E[4 * L + l],
             E[5 * L + l],
         )
-        J, inverse = E[6 * L + l], _inverse(E, l)
+        J = E[6 * L + l]
+        cube_root = _inverse_cube_root(J)
+        root = cube_root * cube_root
+        inverse = _inverse(E, root * root * root, l)
         i0, i1, i2, i3, i4, i5 = inverse
-        root = _exp(-2.0 / 3.0 * _log(J))
         a, b, d_u = 2.0 * c10 * root, 2.0 * c01 * root * root, bulk * (J - 1.0)
         c00, c11, c22 = 1.0 + 2.0 * e00, 1.0 + 2.0 * e11, 1.0 + 2.0 * e22
         first, shears = c00 + c11 + c22, e01 * e01 + e02 * e02 + e12 * e12
@@ -266,7 +291,7 @@ def _mooney_rivlin(E, p, S, D):
         # d = dI₂/dC = I₁ I - C.
         d0, d1, d2 = c11 + c22, c22 + c00, c00 + c11
         d3, d4, d5 = -2.0 * e01, -2.0 * e02, -2.0 * e12
-        third_a, third_b = a * first / 3.0, b * second / 1.5
+        third_a, third_b = THIRD * a * first, 2.0 * THIRD * b * second
         s = J * d_u - third_a - third_b
         S[l], S[L + l], S[2 * L + l] = a + b * d0 + s * i0, a + b * d1 + s * i1, a + b * d2 + s * i2
         S[3 * L + l], S[4 * L + l], S[5 * L + l] = b * d3 + s * i3, b * d4 + s * i4, b * d5 + s * i5
@@ -275,7 +300,7 @@ def _mooney_rivlin(E, p, S, D):
         if D is not None:
             # dS/dE = 2 dS/dC; terms with C⁻¹ first.
             x, v = -4.0 / 3.0 * a, -8.0 / 3.0 * b
-            t = J * (d_u + J * bulk) + (third_a + 2.0 * third_b) / 1.5
+            t = J * (d_u + J * bulk) + 2.0 * THIRD * (third_a + 2.0 * third_b)
             y = (
                 x + v * d0 + t * i0,
                 x + v * d1 + t * i1,
@@ -303,14 +328,16 @@ def _yeoh(E, p, S, D):
     L = LANES
     for l in range(LANES):
         c10, c20, c30, bulk = p[l], p[L + l], p[2 * L + l], p[3 * L + l]
-        J, inverse = E[6 * L + l], _inverse(E, l)
+        J = E[6 * L + l]
+        cube_root = _inverse_cube_root(J)
+        root = cube_root * cube_root
+        inverse = _inverse(E, root * root * root, l)
         i0, i1, i2, i3, i4, i5 = inverse
-        root = _exp(-2.0 / 3.0 * _log(J))
         first = 3.0 + 2.0 * (E[l] + E[L + l] + E[2 * L + l])
         x, d_u = root * first - 3.0, bulk * (J - 1.0)
         # S = a I + s C⁻¹, with a = 2 J^(-2/3) dW/dx.
         a = 2.0 * root * (c10 + x * (2.0 * c20 + 3.0 * c30 * x))
-        third = a * first / 3.0
+        third = THIRD * a * first
         s = J * d_u - third
         S[l], S[L + l], S[2 * L + l] = a + s * i0, a + s * i1, a + s * i2
         S[3 * L + l], S[4 * L + l], S[5 * L + l] = s * i3, s * i4, s * i5
@@ -318,9 +345,9 @@ def _yeoh(E, p, S, D):
         if D is not None:
             # dx/dC = J^(-2/3) (I - I₁/3 C⁻¹); 4 d²W/dx² dx/dC ⊗ dx/dC, with I ⊗ I last.
             w = 4.0 * root * root * (2.0 * c20 + 6.0 * c30 * x)
-            wide = w * first / 3.0
+            wide = THIRD * w * first
             v = -4.0 / 3.0 * a - 2.0 * wide
-            t = J * (d_u + J * bulk) + third / 1.5 + wide * first / 3.0
+            t = J * (d_u + J * bulk) + THIRD * (2.0 * third + wide * first)
             y = v + t * i0, v + t * i1, v + t * i2, t * i3, t * i4, t * i5
             _write(D, l, y, inverse, -s)
             D[l] += w
@@ -351,7 +378,7 @@ def _add_fibres(I, E, stiffness, N, S, D):
         growth, k1 = _exp(k2 * x * x), stiffness[l] if x >= 0.0 else 0.0
         # S = a N + s C⁻¹, with a = 2 J^(-2/3) dW/dx.
         a = 2.0 * root * k1 * x * growth
-        third = a * length / 3.0
+        third = THIRD * a * length
         S[l] += a * n0 - third * i0
         S[L + l] += a * n1 - third * i1
         S[2 * L + l] += a * n2 - third * i2
@@ -362,10 +389,10 @@ def _add_fibres(I, E, stiffness, N, S, D):
         if D is not None:
             # dx/dC = J^(-2/3) (N - N:C/3 C⁻¹); 4 d²W/dx² dx/dC ⊗ dx/dC, with N ⊗ N last.
             w = 4.0 * root * root * k1 * (1.0 + 2.0 * k2 * x * x) * growth
-            wide = w * length / 3.0
+            wide = THIRD * w * length
             I[7 * L + l], I[8 * L + l] = w, third
             I[9 * L + l] = -4.0 / 3.0 * a - 2.0 * wide
-            I[10 * L + l] = third / 1.5 + wide * length / 3.0
+            I[10 * L + l] = THIRD * (2.0 * third + wide * length)
     if D is not None:
         for l in range(LANES):
             inverse = I[l], I[L + l], I[2 * L + l], I[3 * L + l], I[4 * L + l], I[5 * L + l]
@@ -395,21 +422,22 @@ def _holzapfel_gasser_ogden(E, p, S, D):
     work = np.empty(11 * L)
     for l in range(LANES):
         c10, bulk, J = p[l], p[L + l], E[6 * L + l]
-        inverse = _inverse(E, l)
+        cube_root = _inverse_cube_root(J)
+        root = cube_root * cube_root
+        inverse = _inverse(E, root * root * root, l)
         i0, i1, i2, i3, i4, i5 = inverse
-        root = _exp(-2.0 / 3.0 * _log(J))
         work[l], work[L + l], work[2 * L + l] = i0, i1, i2
         work[3 * L + l], work[4 * L + l], work[5 * L + l] = i3, i4, i5
         work[6 * L + l] = root
         first, d_u = 3.0 + 2.0 * (E[l] + E[L + l] + E[2 * L + l]), bulk * (J - 1.0)
         a = 2.0 * c10 * root
-        third = a * first / 3.0
+        third = THIRD * a * first
         s = J * d_u - third
         S[l], S[L + l], S[2 * L + l] = a + s * i0, a + s * i1, a + s * i2
         S[3 * L + l], S[4 * L + l], S[5 * L + l] = s * i3, s * i4, s * i5
         S[6 * L + l] = c10 * (root * first - 3.0) + 0.5 * d_u * (J - 1.0)
         if D is not None:
-            x, t = -4.0 / 3.0 * a, J * (d_u + J * bulk) + third / 1.5
+            x, t = -4.0 / 3.0 * a, J * (d_u + J * bulk) + 2.0 * THIRD * third
             y = x + t * i0, x + t * i1, x + t * i2, t * i3, t * i4, t * i5
             _write(D, l, y, inverse, -s)
     for k in range(4, len(p) // LANES, 6):
@@ -500,17 +528,17 @@ def _add_term(work, mu, alpha, S, D):
             mu[l],
             alpha[l],
         )
-        middle, half = (x0 + x1 + x2) / 3.0, 0.5 * a
+        middle, half = THIRD * (x0 + x1 + x2), 0.5 * a
         p0 = _exp(half * (x0 - middle))
         p1 = _exp(half * (x1 - middle))
         p2 = _exp(half * (x2 - middle))
-        mean = (p0 + p1 + p2) / 3.0
+        mean = THIRD * (p0 + p1 + p2)
         S[6 * L + l] += 3.0 * (m / a) * (mean - 1.0)
         work[BETA + l] += m * (p0 - mean)
         work[BETA + L + l] += m * (p1 - mean)
         work[BETA + 2 * L + l] += m * (p2 - mean)
         if D is not None:
-            f = m * a / 3.0
+            f = THIRD * m * a
             work[GAMMA + l] += f * (mean + p0)
             work[GAMMA + L + l] += f * (mean + p1)
             work[GAMMA + 2 * L + l] += f * (mean + p2)
@@ -603,14 +631,19 @@ def _principal_stress(work, S, D):
     """Write S = Σ_a β_a / v_a a ⊗ a from the principal values, and D if it is not None."""
     L = LANES
     V, v, beta = work[VECTORS:SQUARES], work[SQUARES:LOGS], work[BETA:SLOPES]
-    for m in range(6):
-        i, j, s = V[3 * _I[m] * L :], V[3 * _J[m] * L :], S[m * L :]
-        for l in range(LANES):
-            s[l] = (
-                beta[l] / v[l] * (i[l] * j[l])
-                + beta[L + l] / v[L + l] * (i[L + l] * j[L + l])
-                + beta[2 * L + l] / v[2 * L + l] * (i[2 * L + l] * j[2 * L + l])
-            )
+    for l in range(LANES):
+        s0, s1, s2 = beta[l] / v[l], beta[L + l] / v[L + l], beta[2 * L + l] / v[2 * L + l]
+        a0, a1, a2 = V[l], V[L + l], V[2 * L + l]
+        b0, b1, b2 = V[3 * L + l], V[4 * L + l], V[5 * L + l]
+        c0, c1, c2 = V[6 * L + l], V[7 * L + l], V[8 * L + l]
+        x0, x1, x2 = s0 * a0, s1 * a1, s2 * a2
+        y0, y1, y2 = s0 * b0, s1 * b1, s2 * b2
+        S[l] = x0 * a0 + x1 * a1 + x2 * a2
+        S[L + l] = y0 * b0 + y1 * b1 + y2 * b2
+        S[2 * L + l] = s0 * c0 * c0 + s1 * c1 * c1 + s2 * c2 * c2
+        S[3 * L + l] = x0 * b0 + x1 * b1 + x2 * b2
+        S[4 * L + l] = x0 * c0 + x1 * c1 + x2 * c2
+        S[5 * L + l] = y0 * c0 + y1 * c1 + y2 * c2
     if D is not None:
         _principal_tangent(work, D)
 
@@ -622,9 +655,10 @@ def _ogden(E, p, S, D):
     λ̄ = J^(-1/3) λ; p = (κ, μ₁, α₁, μ₂, α₂, …). Holzapfel, sections 6.5 and 6.6.
     """
     L = LANES
-    work = np.zeros(33 * LANES)
+    work = np.empty(33 * LANES)
     A, v, logs = work[:VECTORS], work[SQUARES:LOGS], work[LOGS:BETA]
     A[:] = E[: 6 * L]
+    work[BETA:] = 0.0
     _diagonalise(A, work[VECTORS:SQUARES])
     for l in range(3 * LANES):
         v[l] = max(1.0 + 2.0 * A[l], 1e-300)
@@ -644,7 +678,7 @@ def _corotational(E, p, S, D):
     division by v_a - v_b is exact.
     """
     L = LANES
-    work = np.zeros(33 * LANES)
+    work = np.empty(33 * LANES)
     A, v = work[:VECTORS], work[SQUARES:LOGS]
     A[:] = E[: 6 * L]
     _diagonalise(A, work[VECTORS:SQUARES])
@@ -912,9 +946,157 @@ def _add_blocks(g, A, T, k_e, n):
             o += 9
 
 
+NEAR, FAR = 0.13819660112501053, 0.58541019662496841
+"""Barycentric coordinates of the points of T10: point q has FAR at corner q, NEAR at the others."""
+
+RISE = 4.0 * (FAR - NEAR)
+"""Difference of the factor of a node in c (see `_corner_displacements`) between two points."""
+
+_MIDDLE = np.array([0, 4, 6, 7, 4, 1, 5, 8, 6, 5, 2, 9, 7, 8, 9, 3])
+"""Node of T10 in the middle between corners i and j, at 4 i + j; a corner between it and itself."""
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _corner_gradients(three, g):
+    """Return g (1, 12): gradients of barycentric coordinates, from those of the last three (1, 9).
+
+    Their sum is zero.
+    """
+    N, x, out = 3 * LANES, three[0], g[0]
+    for k in range(N):
+        out[k], out[N + k] = -(x[k] + x[N + k] + x[2 * N + k]), x[k]
+        out[2 * N + k], out[3 * N + k] = x[N + k], x[2 * N + k]
+    return g
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _quadratic_gradients(corners, q, g):
+    """Return g (30), gradients of the shape functions of a straight T10 at its q-th point."""
+    N = 3 * LANES
+    for i in range(4):
+        at_i = 4.0 * (FAR if i == q else NEAR)
+        for j in range(i + 1):
+            at_j = 4.0 * (FAR if j == q else NEAR)
+            x, y, out = corners[i * N :], corners[j * N :], g[_MIDDLE[4 * i + j] * N :]
+            both = at_i - 1.0 - at_j if i == j else at_i
+            for k in range(N):
+                out[k] = at_j * x[k] + both * y[k]
+    return g
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _mean_corners(u, work):
+    """Write what `_corner_displacements` has in common at all points (12), and zeros (9)."""
+    N = 3 * LANES
+    work[8 * N :] = 0.0
+    for i in range(4):
+        m, n, o = (i + 1) % 4, (i + 2) % 4, (i + 3) % 4
+        x, out = u[i * N : (i + 1) * N], work[(4 + i) * N : (5 + i) * N]
+        y0, y1, y2 = (
+            u[_MIDDLE[4 * i + m] * N :],
+            u[_MIDDLE[4 * i + n] * N :],
+            u[_MIDDLE[4 * i + o] * N :],
+        )
+        for k in range(N):
+            out[k] = (4.0 * NEAR - 1.0) * x[k] + 4.0 * NEAR * (y0[k] + y1[k] + y2[k])
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _corner_displacements(u, q, work):
+    """Return c (12) at point q of a straight T10, with du/dX = Σ_i c_i ⊗ grad λ_i.
+
+    c_i = (4 λ_i - 1) u_i + 4 Σ_j λ_j u_ij, with u_ij of the middle between corners i and j.
+    """
+    N = 3 * LANES
+    for i in range(4):
+        x, y, out = work[(4 + i) * N : (5 + i) * N], u[_MIDDLE[4 * i + q] * N :], work[i * N :]
+        for k in range(N):
+            out[k] = x[k] + RISE * y[k]
+    return work[: 4 * N]
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _add_quadratic_forces(P, corners, q, work, f):
+    """Add to f (30) forces conjugate to `_corner_displacements`, and P to its sum (9)."""
+    L = LANES
+    total = work[24 * L :]
+    for i in range(4):
+        g, out = corners[3 * i * L : (3 * i + 3) * L], f[3 * _MIDDLE[4 * i + q] * L :]
+        for l in range(LANES):
+            g0, g1, g2 = RISE * g[l], RISE * g[L + l], RISE * g[2 * L + l]
+            out[l] += P[l] * g0 + P[L + l] * g1 + P[2 * L + l] * g2
+            out[L + l] += P[3 * L + l] * g0 + P[4 * L + l] * g1 + P[5 * L + l] * g2
+            out[2 * L + l] += P[6 * L + l] * g0 + P[7 * L + l] * g1 + P[8 * L + l] * g2
+    for k in range(9 * L):
+        total[k] += P[k]
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _add_mean_forces(corners, work, f):
+    """Add to f (30) the forces conjugate to `_mean_corners`, of the sum of P over the points."""
+    N = 3 * LANES
+    t = work[: 4 * N]
+    t[:] = 0.0
+    _add_forces(work[8 * N :], corners, t, 4)
+    for i in range(4):
+        x, out = t[i * N :], f[i * N :]
+        for k in range(N):
+            out[k] += (4.0 * NEAR - 1.0) * x[k]
+        for j in range(i):
+            y, out = t[j * N :], f[_MIDDLE[4 * i + j] * N :]
+            for k in range(N):
+                out[k] += 4.0 * NEAR * (x[k] + y[k])
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _gather(u, dofs, u_e, n):
+    """Copy the displacements of the nodes of a batch; numba tests signed indices for < 0."""
+    L = LANES
+    for a in range(n):
+        for l in range(LANES):
+            d, o = np.uint64(dofs[a, l]), 3 * a * L + l
+            u_e[o], u_e[o + L], u_e[o + 2 * L] = u[d], u[d + np.uint64(1)], u[d + np.uint64(2)]
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _add_node(f, dofs, a, l, force):
+    """Add the three forces of node a of cell l."""
+    L = LANES
+    d, o = np.uint64(dofs[a, l]), 3 * a * L + l
+    force[d] += f[o]
+    force[d + np.uint64(1)] += f[o + L]
+    force[d + np.uint64(2)] += f[o + 2 * L]
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _scatter(f, dofs, force, n):
+    """Add the nodal forces f of a batch of cells with n nodes to ``force``.
+
+    Neighbouring tetrahedra share nodes. If the inner loop ran over them, each sum would wait for
+    the one before it.
+    """
+    if n == 8:
+        for a in range(n):
+            for l in range(LANES):
+                _add_node(f, dofs, a, l, force)
+    else:
+        for l in range(LANES):
+            for a in range(n):
+                _add_node(f, dofs, a, l, force)
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _move_tangents(k_e, slots, values):
+    """Add the upper entries k_e of a batch to ``values``, and set them to zero."""
+    for o in range(len(slots)):
+        for l in range(LANES):
+            values[slots[o, l]] += k_e[o * LANES + l]
+    k_e[:] = 0.0
+
+
 # Longer than 60 lines because numba knows the constants of a kernel only where it is defined.
 @cache
-def general_force(law: int, n_nodes: int):
+def general_force(law: int, n_nodes: int, is_straight: bool):
     """Return the kernel ``force(u, dofs, gradients, weights, parameters, slots, force, values)``.
 
     It adds the internal force of batches of cells to ``force`` and, if it is not None, the tangent
@@ -922,18 +1104,20 @@ def general_force(law: int, n_nodes: int):
 
     Parameters of the kernel
     ------------------------
-    u : (n_dofs + 1,) float64
-        Displacements, m; the last entry, of the dummy dof, is zero.
-    dofs : (n_batches, 3 n_nodes, LANES) int32
-    gradients : (n, n_points, 3 n_nodes * LANES) float64
-        dN_a/dX_j at entry (3a + j) * LANES + lane, 1/m. Batch b has those of b mod n.
+    u : (n,) float64
+        Displacements, m. Fixed nodes and padding read zeros behind the unknowns.
+    dofs : (n_batches, n_nodes, LANES) uint32
+        First of the three entries of each node in ``u`` and ``force``.
+    gradients : (n, n_points, 3 n_nodes * LANES) or (n, 1, 9 * LANES) float64
+        dN_a/dX_j at entry (3a + j) * LANES + lane, 1/m. Batch b has those of b mod n. Straight
+        tetrahedra have the gradients of their last three barycentric coordinates.
     weights : (n_batches, n_points, LANES) float64
         Quadrature weight times det J, m³; zero for padding.
     parameters : (n_points, n_parameters * LANES) float64
         Law parameters of each quadrature point. A point may carry only the volumetric part, or
         only the rest.
     slots : (n_batches, n_upper, LANES) int32 or None
-    force : (n_dofs + 1,) float64
+    force : (n,) float64
     values : (n_upper_nonzeros + 1,) float64 or None
 
     Returns
@@ -943,27 +1127,32 @@ def general_force(law: int, n_nodes: int):
         where det F <= 0, because the laws have no meaning there.
     """
 
+    is_quadratic = is_straight and n_nodes == 10
+
     @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
     def kernel(u, dofs, gradients, weights, parameters, slots, force, values):
         L = LANES
         u_e, f_e = np.empty(3 * n_nodes * L), np.empty(3 * n_nodes * L)
+        corners, work, g = np.empty((1, 12 * L)), np.empty(33 * L), np.empty(30 * L)
         H, F, S, P = np.empty(9 * L), np.empty(17 * L), np.empty(7 * L), np.empty(9 * L)
         E, D = F[9 * L : 16 * L], None if values is None else np.empty(21 * L)
         totals = np.zeros(2 * L)
         totals[L:] = np.inf
         if values is not None:
             X, A, T = np.empty(18 * L), np.empty(81 * L), np.empty(27 * L)
-            k_e = np.empty(slots.shape[1] * L)
+            k_e = np.zeros(slots.shape[1] * L)
         for b in range(dofs.shape[0]):
-            for i in range(3 * n_nodes):
-                for l in range(LANES):
-                    u_e[i * L + l] = u[dofs[b, i, l]]
+            _gather(u, dofs[b], u_e, n_nodes)
             f_e[:] = 0.0
-            if values is not None:
-                k_e[:] = 0.0
-            for q in range(gradients.shape[1]):
-                g = gradients[b % gradients.shape[0], q]
-                _displacement_gradient(u_e, g, H, n_nodes)
+            given = gradients[b % gradients.shape[0]]
+            shapes = _corner_gradients(given, corners) if is_straight else given
+            if is_quadratic:
+                _mean_corners(u_e, work)
+            for q in range(len(parameters)):
+                if is_quadratic:
+                    _displacement_gradient(_corner_displacements(u_e, q, work), corners[0], H, 4)
+                else:
+                    _displacement_gradient(u_e, shapes[q], H, n_nodes)
                 _strain(H, weights[b, q], F, totals)
                 if law == SAINT_VENANT_KIRCHHOFF:
                     _saint_venant_kirchhoff(E, parameters[q], S, D)
@@ -980,17 +1169,19 @@ def general_force(law: int, n_nodes: int):
                 else:
                     _ogden(E, parameters[q], S, D)
                 _weigh(F, S, P, totals)
-                _add_forces(P, g, f_e, n_nodes)
+                if is_quadratic:
+                    _add_quadratic_forces(P, corners[0], q, work, f_e)
+                else:
+                    _add_forces(P, shapes[q], f_e, n_nodes)
                 if values is not None:
                     _derivative(F, S, D, X, A)
-                    _add_blocks(g, A, T, k_e, n_nodes)
-            for i in range(3 * n_nodes):
-                for l in range(LANES):
-                    force[dofs[b, i, l]] += f_e[i * L + l]
+                    own = _quadratic_gradients(corners[0], q, g) if is_quadratic else shapes[q]
+                    _add_blocks(own, A, T, k_e, n_nodes)
+            if is_quadratic:
+                _add_mean_forces(corners[0], work, f_e)
+            _scatter(f_e, dofs[b], force, n_nodes)
             if values is not None:
-                for o in range(slots.shape[1]):
-                    for l in range(LANES):
-                        values[slots[b, o, l]] += k_e[o * L + l]
+                _move_tangents(k_e, slots[b], values)
         return totals[:L].sum(), totals[L:].min()
 
     return kernel
@@ -1057,11 +1248,11 @@ SWEEP_MULTIPLY_ADDS = 87
 _LAW_MULTIPLY_ADDS = {
     SAINT_VENANT_KIRCHHOFF: (15, 1),
     NEO_HOOKEAN: (38, 87),
-    MOONEY_RIVLIN: (71, 102),
-    YEOH: (52, 102),
-    COROTATIONAL: (80 + 4 * SWEEP_MULTIPLY_ADDS, 294),
-    OGDEN: (64 + 4 * SWEEP_MULTIPLY_ADDS, 284),
-    HOLZAPFEL_GASSER_OGDEN: (46, 91),
+    MOONEY_RIVLIN: (70, 102),
+    YEOH: (51, 102),
+    COROTATIONAL: (56 + 4 * SWEEP_MULTIPLY_ADDS, 294),
+    OGDEN: (40 + 4 * SWEEP_MULTIPLY_ADDS, 284),
+    HOLZAPFEL_GASSER_OGDEN: (45, 91),
 }
 """Multiply-adds per point for energy and stress, and for the tangent; 4 sweeps are usual."""
 
@@ -1083,9 +1274,14 @@ def point_multiply_adds(law: int, n_parameters: int) -> tuple[int, int]:
     return stress, by_tangent + terms * term_tangent + _DERIVATIVE_MULTIPLY_ADDS
 
 
-def general_multiply_adds(law: int, n_parameters: int, n_nodes: int) -> tuple[int, int]:
-    """Return multiply-adds of `general_force` per point: the force alone, and with tangent."""
+def general_multiply_adds(
+    law: int, n_parameters: int, n_nodes: int, n_points: int, is_straight: bool
+) -> tuple[int, int]:
+    """Return multiply-adds of `general_force` per cell: the force alone, and with tangent."""
     stress, derivative = point_multiply_adds(law, n_parameters)
-    force = 18 * n_nodes + stress
     blocks = n_nodes * (81 + 18) + n_nodes * (n_nodes - 1) // 2 * 27
-    return force, force + derivative + blocks
+    shapes, mean, gradients = 18 * n_nodes, 0, 0
+    if is_straight and n_nodes == 10:
+        shapes, mean, gradients = 96, 90, 60
+    force = n_points * (shapes + stress)
+    return mean + force, mean + force + n_points * (derivative + gradients + blocks)
