@@ -27,13 +27,14 @@ TURNING = 1e-2
 """Correction, relative to the displacement, above which nodal rotations are updated."""
 PROBE_FROM = 0.1
 """Residual, relative to the load, at which probing begins; the tangent hardly changes later."""
-PROBES = 3
+PROBES = 8
 """Most directions, soft ones first, that are probed for negative curvature."""
-STIFF = 0.5
-"""Lowest curvature of two probes, relative to P, from which no third is needed.
+FALL_OF_TWO, FALL, SPREAD = 0.1, 0.2, 0.4
+"""When the lowest curvature of the probes, relative to P, has settled.
 
-It misses no buckling that three probes notice, also of a strut beside a softer body. One probe with
-little spread of its curvatures missed some.
+The last probe lowered it by at most this share: of two probes, whose curvatures differ by at most
+`SPREAD`, or of more. Columns that are guided at both ends need up to five probes: with two, the
+lowest curvature is still 0.9 where buckling has made the true one negative.
 """
 PROBE_LENGTH = 1e-6
 """Length of the finite difference along a probe, relative to the body."""
@@ -50,7 +51,8 @@ class Probes:
 
     The first probe is the rotated response to a random force, which soft modes dominate. Each next
     probe is P⁻¹K of the previous one, as in Lanczos' method. Products with K are differences of
-    the internal force. Two probes are enough if their curvatures relative to P are far from zero.
+    the internal force. The probes suffice when their lowest curvature
+    relative to P has settled.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -58,7 +60,8 @@ class Probes:
         self._probes: list[Array] = []
         self._products: list[Array] = []
         self._pulls: list[Array] = []
-        self.complete = False
+        self._lowest = np.nan
+        self._settled = False
 
     @property
     def begun(self) -> bool:
@@ -79,21 +82,29 @@ class Probes:
         self._probes.append(probe)
         self._pulls.append(length * pull)
         self._products.append(self._problem.force(q + probe).force - force)
-        n = len(self._probes)
-        self.complete = n >= PROBES or (n == 2 and self._stiff)
+        before, curvatures = self._lowest, self._curvatures()
+        self._lowest, two = float(curvatures[0]), len(curvatures) == 2
+        falls_little = before - self._lowest <= (FALL_OF_TWO if two else FALL) * self._lowest
+        self._settled = falls_little and not (two and curvatures[1] - curvatures[0] > SPREAD)
 
     @property
-    def _stiff(self) -> bool:
-        """True if the lowest curvature of the probes, relative to P, is far from zero."""
+    def complete(self) -> bool:
+        """True if no further probe is needed or allowed."""
+        return self._settled or len(self._probes) >= PROBES or self._lowest <= 0.0
+
+    def _curvatures(self) -> Array:
+        """Return the curvatures of the probes relative to P in ascending order, (n,), or NaN."""
         probes, products = np.array(self._probes), np.array(self._products)
         size, matrix = probes @ np.array(self._pulls).T, probes @ products.T
         if not (np.isfinite(matrix).all() and float(np.linalg.det(size)) > 0):
-            return False
-        return float(np.linalg.eigvals(np.linalg.solve(size, matrix)).real.min()) >= STIFF
+            return np.full(len(probes), np.nan)
+        return np.sort(np.linalg.eigvals(np.linalg.solve(size, matrix)).real)
 
     @property
     def convex(self) -> bool:
-        """True if no combination of the probes has negative curvature."""
+        """True if the lowest curvature has settled, and no combination of probes has a negative."""
+        if not self._settled:
+            return False
         probes, products = np.array(self._probes), np.array(self._products)
         matrix = probes @ products.T
         scale = np.sqrt(np.abs(np.diag(matrix)))

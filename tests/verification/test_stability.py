@@ -11,7 +11,8 @@ from mor_bench.errors import LimitPointError, SolverError
 from mor_bench.hard_cases.setups import LAW, LIMIT_PA, Arch, confined_column, dense, make_arch
 from mor_bench.mechanics import accelerated
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.mechanics.newton import solve_equilibrium
+from mor_bench.mechanics.newton import Solution, solve_equilibrium
+from mor_bench.mechanics.observed import ObservedModel
 from mor_bench.mechanics.problem import Attempt
 from mor_bench.mechanics.stability import (
     LimitPoint,
@@ -182,3 +183,44 @@ def test_buckling_is_noticed_under_a_symmetric_load_also_beside_a_softer_body(
         stable = lowest_tangent_eigenvalue(model, q) > 0
         assert stable == (factor < 1.2)
         assert straight(factor, q).converged == stable
+
+
+BAR = {
+    "geometry": {"shape": "box", "size_m": [4.0, 1.0, 1.0], "cells": [16, 4, 4]},
+    "material": {"law": "neo-hookean", "young_pa": 500.0, "poisson": 0.4},
+}
+EULER_PA = 4.0 * np.pi**2 * 500.0 / 12.0 / 4.0**2
+"""Buckling pressure of the bar as a slender beam that is guided at both ends; it is stocky."""
+
+
+@pytest.mark.parametrize("factor", [0.3, 0.5, 0.8, 1.0])
+def test_a_column_that_is_guided_at_both_ends_is_solved_for_a_stable_state(factor: float) -> None:
+    """Its buckling mode is not among the softest modes at rest, so few probes do not see it."""
+    guide = {"region": "x-max", "components": ["y", "z"]}
+    scene = mor_bench.load_scene({**BAR, "supports": [{"region": "x-min"}, guide]})
+    model, points, cells = FullOrderModel(scene), scene.mesh.points, scene.mesh.cells
+    end = points[:, 0] == points[:, 0].max()
+    corners = end[cells] & (end[cells].sum(axis=1) == 4)[:, None]
+    load = np.zeros_like(points)
+    load[:, 0] = -np.bincount(cells[corners], minlength=len(points)) / corners.sum()
+    push = factor * EULER_PA * load.ravel()[scene.free_dofs]
+    q = model.solve(push).displacement
+    assert lowest_tangent_eigenvalue(model, q) > 0
+    aside = scene.at_all_dofs(q[None])[0].reshape(-1, 3)[:, 1:]
+    assert (np.abs(aside).max() > 0.5) == (factor > 0.6)
+
+
+@pytest.mark.parametrize("motion", [(-0.5, 0.1, 0.0), (-0.9, 0.0, 0.0), (-1.0, 0.0, 0.01)])
+def test_a_column_under_a_moved_tool_is_solved_for_a_stable_state(
+    motion: tuple[float, float, float],
+) -> None:
+    tool = {"kind": "displacement", "region": "x-max", "magnitude_m": [0.0, 1.0], "samples": 1}
+    scene = mor_bench.load_scene({**BAR, "supports": [{"region": "x-min"}], "loads": tool})
+    moved = np.tile(motion, (scene.mesh.n_nodes, 1)).ravel()[scene.free_dofs]
+    (found,) = ObservedModel(scene).solve_many(moved[None])
+    assert isinstance(found, Solution)
+    assert scene.observed_nodes is not None
+    model = FullOrderModel(scene)
+    tangent = dense(model.assembler, model.linearise(found.displacement)[1])
+    hidden = ~np.isin(scene.free_dofs // 3, scene.observed_nodes)
+    assert np.linalg.eigvalsh(tangent[np.ix_(hidden, hidden)])[0] > 0
