@@ -42,18 +42,28 @@ def _medians(row: Mapping[str, Any]) -> NDArray[np.float64]:
 
 
 def peers(source: str) -> str:
-    """Show the time of each code over that of the first, the median over loads."""
+    """Show the time of each code over that of the first; SOURCE is FILE,FILE,….
+
+    It is the median over loads.
+    """
+    files = [content_of(file)["datasets"] for file in source.split(",")]
     columns = {
-        dataset: {
+        _column(dataset, found): {
             row["name"]: f"{number(row['times_as_long'])} "
             f"({number(float(np.median(_medians(row))))} ms)"
             for row in found["contenders"]
         }
-        for dataset, found in content_of(source)["datasets"].items()
+        for file in files
+        for dataset, found in file.items()
     }
     names = list(dict.fromkeys(name for column in columns.values() for name in column))
     body = [[name, *(column.get(name, DASH) for column in columns.values())] for name in names]
     return markdown(["", *columns], body)
+
+
+def _column(dataset: str, found: Mapping[str, Any]) -> str:
+    """Return the name of a shipped dataset, or the size of another."""
+    return dataset if "/" not in dataset else f"beam, {found['n_unknowns']:,} unknowns"
 
 
 def reduced_peers(source: str) -> str:
