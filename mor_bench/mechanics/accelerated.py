@@ -94,6 +94,9 @@ class Probes:
 
     def _curvatures(self) -> Array:
         """Return the curvatures of the probes relative to P in ascending order, (n,), or NaN."""
+        if len(self._probes) == 1:
+            (probe,), (product,), (pull,) = self._probes, self._products, self._pulls
+            return np.array([float(probe @ product) / float(probe @ pull)])
         probes, products = np.array(self._probes), np.array(self._products)
         size, matrix = probes @ np.array(self._pulls).T, probes @ products.T
         if not (np.isfinite(matrix).all() and float(np.linalg.det(size)) > 0):
