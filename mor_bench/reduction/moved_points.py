@@ -38,7 +38,7 @@ MARGIN = 0.95
 LONGEST_STEP = 0.5
 """Longest move along an axis of a cell in one step; a cell has length 2."""
 LEAST_SHARE = 0.05
-"""Share of its weight that a point keeps at least in one step, so that weights stay positive."""
+"""Least share of its weight that a point keeps in one step, and of the squared tolerance in use."""
 MAX_STEPS = 30
 """Steps of one least-squares fit."""
 DAMPINGS = 8
@@ -178,23 +178,26 @@ class _Fit:
         self._cells, self._at = _Cells(mesh), _Interpolant(integrands, directions)
         self._integrands, self._target, self._directions = integrands, target, directions
         self._interpolated = target @ directions  # the target less the error of interpolation
+        self._outside = 0.0  # the error outside of the directions
 
     def __call__(self, rule: PointRule, tolerance: float) -> PointRule | None:
         """Return a rule whose integrals meet the tolerance, or None if none is found.
 
         Each fit of interpolated integrands ends with the exact ones. Their difference, nearly the
-        same from one rule to the next, corrects the target.
+        same from one rule to the next, corrects the target and the residual that is aimed at.
         """
         enough = tolerance * float(np.linalg.norm(self._target))
         for _ in range(CORRECTIONS):
-            found = self._fitted(rule, MARGIN * enough)
+            share = np.sqrt(max(1 - (self._outside / enough) ** 2, LEAST_SHARE))
+            found = self._fitted(rule, MARGIN * share * enough)
             if found is None:
                 return None
-            rule, exact = found, found.integrate(self._integrands)
-            if np.linalg.norm(exact - self._target) <= enough:
+            rule, error = found, self._target - found.integrate(self._integrands)
+            if np.linalg.norm(error) <= enough:
                 return rule
-            interpolated = rule.weights @ self._at(rule.cells, rule.positions)[:, 0]
-            self._interpolated = interpolated + (self._target - exact) @ self._directions
+            seen = error @ self._directions
+            self._outside = float(np.linalg.norm(error - self._directions @ seen))
+            self._interpolated = rule.weights @ self._at(rule.cells, rule.positions)[:, 0] + seen
         return None
 
     def _slopes(self, rule: PointRule, found: Array) -> Array:
