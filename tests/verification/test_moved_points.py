@@ -21,11 +21,10 @@ from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.hpod import HyperReducedPOD
-from mor_bench.surrogates.hyper_reduced import nodal, reduced_points
 
 from .laws_and_elements import LAWS
 from .scenes import scene_of
-from .test_gravity import sagging
+from .test_springs import bedded
 
 Array = NDArray[np.float64]
 BOTH = {"n_modes": 6, "cubature_tolerance": 5e-3, "tolerance": 1e-8, "matching": "force"}
@@ -149,12 +148,15 @@ def test_points_move_in_hexahedra_with_full_integration_only(scene: Scene) -> No
         method.fit(scene, None)
 
 
-def test_moved_points_measure_from_a_rest_state() -> None:
-    """Without a load, a body under its own weight stays at rest."""
-    scene = sagging("neo-hookean")
-    n, rng = scene.mesh.n_cells, np.random.default_rng(1)
-    modes = nodal(scene, np.linalg.qr(rng.normal(size=(len(scene.free_dofs), 3)))[0])
-    positions = rng.uniform(-1, 1, (n, 3))
-    points = reduced_points(scene, np.arange(n), np.ones(n), modes, positions=positions)
-    whole = points.force_and_tangent(np.zeros(3))
-    assert np.abs(whole[0].force).max() <= 1e-12 * np.abs(whole[1]).max()
+def test_moved_points_leave_springs_and_the_rest_state_to_the_model(cache: Path) -> None:
+    spec = bedded(gravity={"density_kg_m3": 2.0}).spec
+    data = mor_bench.load_dataset(spec, limit=40, cache=cache, workers=1)
+    plain = mor_bench.load_method("pod", n_modes=5).fit(data.scene, data.train)
+    expected = plain.predict(data.train.forces)
+    more, fewer = (
+        HyperReducedPOD(5, 5e-3, sampling=sampling).fit(data.scene, data.train)
+        for sampling in ("points", "moved")
+    )
+    assert fewer.problem_.points.n_points <= 0.7 * more.problem_.points.n_points
+    apart = np.linalg.norm(fewer.predict(data.train.forces) - expected)
+    assert apart <= 0.01 * np.linalg.norm(expected)
