@@ -50,8 +50,10 @@ def take_array(
     return np.ascontiguousarray(array)
 
 
-def take_indices(model: Mapping[str, NDArray[Any]], name: str, size: int) -> NDArray[np.int64]:
-    """Return one array of at least one distinct integer in [0, size).
+def take_indices(
+    model: Mapping[str, NDArray[Any]], name: str, size: int, *, distinct: bool = True
+) -> NDArray[np.int64]:
+    """Return one array of at least one integer in [0, size), by default distinct ones.
 
     Raises
     ------
@@ -66,9 +68,10 @@ def take_indices(model: Mapping[str, NDArray[Any]], name: str, size: int) -> NDA
         not good
         or indices.min() < 0
         or indices.max() >= size
-        or len(np.unique(indices)) != len(indices)
+        or (distinct and len(np.unique(indices)) != len(indices))
     ):
-        raise InvalidInputError(f"`{name}` must be different integers in [0, {size - 1}].")
+        kind = "different integers" if distinct else "integers"
+        raise InvalidInputError(f"`{name}` must be {kind} in [0, {size - 1}].")
     return indices.astype(np.int64)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import UnsupportedSceneError
 from mor_bench.mechanics.elements import element_of, shape_gradients
+from mor_bench.scene.interpolation import trilinear
 from mor_bench.scene.materials import Material
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import NO_EQUATIONS
@@ -37,6 +38,9 @@ class Discretisation:
     rest : (n_nodes, 3) float64, optional
         Displacements of a rest state under a constant pre-load, m. Displacements and forces are
         then measured from it.
+    positions : (n_cells, 3) float64, optional
+        One point of each cell in [-1, 1]³ with weight 1, instead of the element's own quadrature.
+        Only for H8 with full integration. A cell may occur several times in `cells`.
     """
 
     points: Array
@@ -45,6 +49,12 @@ class Discretisation:
     selective: bool = False
     springs: sp.csr_array | None = None
     rest: Array | None = None
+    positions: Array | None = None
+
+    @property
+    def n_cell_points(self) -> int:
+        """Number of quadrature points of a cell, without the mean of selective integration."""
+        return 1 if self.positions is not None else len(element_of(self.cells).weights)
 
 
 def discretisation_of(
@@ -97,6 +107,10 @@ def quadrature_of(body: Discretisation) -> Quadrature:
     every point (B-bar: Hughes, IJNME 15, 1980). The energy is a sum of both parts, so the tangent
     stays symmetric. The pressure is constant in a cell and may oscillate between cells.
     """
+    if body.positions is not None:
+        derivatives = trilinear(body.positions)[1][:, None]
+        gradients, det_j = shape_gradients(body.points, body.cells, derivatives)
+        return Quadrature(gradients, det_j, law_parameters(body))
     element = element_of(body.cells)
     gradients, det_j = shape_gradients(body.points, body.cells, element.derivatives)
     weights = det_j * element.weights
@@ -114,7 +128,7 @@ def quadrature_of(body: Discretisation) -> Quadrature:
 
 def law_parameters(body: Discretisation) -> Array:
     """Return the law's parameters (n_points, n_parameters) at the quadrature points of a cell."""
-    material, n = body.material, len(element_of(body.cells).weights)
+    material, n = body.material, body.n_cell_points
     if body.selective:
         return np.array([material.shape_parameters] * n + [material.volume_parameters])
     return np.array([material.parameters] * n)

@@ -48,9 +48,9 @@ class Element:
 
 _LINEAR = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
-_GAUSS = (2.0 * HEX_CORNERS - 1.0) / np.sqrt(3.0)
+GAUSS = (2.0 * HEX_CORNERS - 1.0) / np.sqrt(3.0)
 
-_VALUES, _DERIVATIVES = trilinear(_GAUSS)
+_VALUES, _DERIVATIVES = trilinear(GAUSS)
 H8 = Element("H8", _DERIVATIVES, np.ones(8), trilinear(np.zeros((1, 3)))[1][0], _VALUES)
 T4 = Element("T4", _LINEAR[None], np.array([1.0 / 6.0]), _LINEAR, np.full((1, 4), 0.25))
 
@@ -98,7 +98,8 @@ def shape_gradients(
     ----------
     points : (n_nodes, 3) float64
     cells : (n_cells, n_cell_nodes) int
-    derivatives : (n_points, n_cell_nodes, 3) float64
+    derivatives : (n_points, n_cell_nodes, 3) or (n_cells, n_points, n_cell_nodes, 3) float64
+        The same points in every cell, or own points for each.
 
     Returns
     -------
@@ -112,7 +113,8 @@ def shape_gradients(
     InvalidInputError
         If det J is not positive at some point: the cell is inverted or degenerate.
     """
-    jacobian = np.einsum("qai,cak->cqki", derivatives, points[cells])
+    each = np.broadcast_to(derivatives, (len(cells), *derivatives.shape[-3:]))
+    jacobian = np.einsum("cqai,cak->cqki", each, points[cells])
     det_j = np.linalg.det(jacobian)
     # The det J of a flat cell is of round-off size rather than zero.
     least = 1e-12 * np.linalg.norm(jacobian, axis=(2, 3)) ** 3
@@ -122,4 +124,4 @@ def shape_gradients(
             f"cell {cell} is inverted or degenerate: det J must be > 0 m³; "
             f"got {det_j[cell, point]:.3g} at quadrature point {point}."
         )
-    return np.einsum("qai,cqik->cqak", derivatives, np.linalg.inv(jacobian)), det_j
+    return np.einsum("cqai,cqik->cqak", each, np.linalg.inv(jacobian)), det_j

@@ -65,6 +65,13 @@ def _hexahedron(
     return shape, np.where(missed, np.inf, np.maximum(np.abs(xi).max(axis=1) - 1, 0))
 
 
+def reference_positions(
+    corners: NDArray[np.float64], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the reference coordinates (n, 3) of points (n, 3) in hexahedra (n, 8, 3), or near."""
+    return _inverted(trilinear, corners, points, np.zeros_like(points))[1]
+
+
 def _quadratic_tetrahedron(
     nodes: NDArray[np.float64], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +28,10 @@ class EmpiricalCubaturePOD(CubatureSurrogate):
 
     def choose_cells(
         self, states: States, modes: Array, tolerance: float
-    ) -> tuple[NDArray[np.int64], Array]:
+    ) -> dict[str, NDArray[Any]]:
         ((model, q),) = states()
         weights = empirical_cubature(
             ecsw_system(model.assembler, model.cell_dofs, modes, q), tolerance
         ).weights
         cells = np.flatnonzero(weights)
-        return cells, weights[cells]
+        return {"cells": cells, "weights": weights[cells]}

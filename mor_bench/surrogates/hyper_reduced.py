@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -50,9 +50,14 @@ def reduced_points(
     weights: Array,
     modes: Array,
     test_modes: Array | None = None,
+    positions: Array | None = None,
 ) -> ReducedPoints:
-    """Return the scene's law over some cells, with nodal modes and test modes (n_nodes, 3, r)."""
-    return ReducedPoints(body_of(scene, cells), weights, modes, test_modes)
+    """Return the scene's law over some cells, with nodal modes and test modes (n_nodes, 3, r).
+
+    With ``positions`` (n, 3), each entry of ``cells`` has a single point; see `Discretisation`.
+    """
+    body = replace(body_of(scene, cells), positions=positions)
+    return ReducedPoints(body, weights, modes, test_modes)
 
 
 CUBATURE_TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3)
@@ -102,9 +107,10 @@ class CubatureSurrogate(Surrogate):
     @abstractmethod
     def choose_cells(
         self, states: States, modes: Array, tolerance: float
-    ) -> tuple[NDArray[np.int64], Array]:
-        """Return the kept cells, and their weights (n,) or those of their points (n, n_points).
+    ) -> dict[str, NDArray[Any]]:
+        """Return the model's ``cells`` (n,), and ``weights`` of them (n,) or of their points.
 
+        ``positions`` (n, 3) mean that an entry of ``cells`` has a single point there.
         There is one body, unless the class takes sampled parameters and the scene has some.
         """
 
@@ -112,10 +118,10 @@ class CubatureSurrogate(Surrogate):
         displacements, tolerance = samples.free_displacements, self.value("cubature_tolerance")
         modes = accurate_modes(displacements, self.value("n_modes"))
         if tolerance == 0:
-            cells, weights = np.arange(scene.mesh.n_cells), np.ones(scene.mesh.n_cells)
-        else:
-            cells, weights = self.choose_cells(*self._matched(scene, samples, modes), tolerance)
-        return {"modes": modes, "cells": cells, "weights": weights}
+            whole = {"cells": np.arange(scene.mesh.n_cells), "weights": np.ones(scene.mesh.n_cells)}
+            return {"modes": modes, **whole}
+        chosen = self.choose_cells(*self._matched(scene, samples, modes), tolerance)
+        return {"modes": modes, **chosen}
 
     def _matched(self, scene: Scene, samples: Snapshots, modes: Array) -> tuple[States, Array]:
         """Return training states, and the modes on which their forces are matched."""
@@ -131,7 +137,11 @@ class CubatureSurrogate(Surrogate):
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
         self.modes_ = take_array(model, "modes", (len(scene.free_dofs), None))
-        self.cells_ = take_indices(model, "cells", scene.mesh.n_cells)
+        moved = "positions" in model
+        self.cells_ = take_indices(model, "cells", scene.mesh.n_cells, distinct=not moved)
+        self.positions_ = take_array(model, "positions", (len(self.cells_), 3)) if moved else None
+        if moved and not (np.abs(model["positions"]) <= 1).all():
+            raise InvalidInputError("`positions` must be in [-1, 1].")
         shape = (len(self.cells_), None)[: model["weights"].ndim]
         self.weights_ = take_array(model, "weights", shape)
         by_cell = self.weights_.reshape(len(self.cells_), -1)
@@ -151,7 +161,8 @@ class CubatureSurrogate(Surrogate):
             self.bodies_ = Bodies(scene)
 
     def _problem(self, scene: Scene) -> CubatureProblem:
-        points = reduced_points(scene, self.cells_, self.weights_, self._on_nodes)
+        rule = self.cells_, self.weights_, self._on_nodes
+        points = reduced_points(scene, *rule, positions=self.positions_)
         return CubatureProblem(points, extent_of(scene))
 
     def _problem_of(self, parameters: Array) -> CubatureProblem:
@@ -159,7 +170,7 @@ class CubatureSurrogate(Surrogate):
         scene = self.bodies_.at(parameters)
         if self.scene_.springs or scene.generated.gravity is not None:
             return self._problem(scene)
-        body = body_of(scene, self.cells_)
+        body = replace(body_of(scene, self.cells_), positions=self.positions_)
         points = self.problem_.points.scaled(body, scale_of(self.scene_, parameters))
         return CubatureProblem(points, extent_of(scene))
 

@@ -72,6 +72,7 @@ def hyper(size: int) -> list[Contender]:
     for matching in ("force", "energy"):
         cubatures: dict[str, tuple[str, Parameters]] = {
             "hpod, points": ("hpod", {"sampling": "points", "cubature_tolerance": 5e-3}),
+            "hpod, moved": ("hpod", {"sampling": "moved", "cubature_tolerance": 5e-3}),
             "hpod, cells": ("hpod", {"sampling": "cells", "cubature_tolerance": 5e-3}),
             "ecm": ("ecm", {"cubature_tolerance": 1e-2}),
         }
