@@ -275,9 +275,11 @@ class Assembler:
 
     def _chosen(self, chosen: slice) -> Batches:
         """Return the data of some batches of cells."""
-        # One batch of gradients serves all if cells are equal.
-        own = len(self._gradients) == len(self._dofs)
-        gradients = self._gradients[chosen] if own else self._gradients
+        gradients = self._gradients
+        if len(gradients) == len(self._dofs):
+            gradients = gradients[chosen]
+        elif (chosen.start or 0) % len(gradients):  # a few batches serve all, in turn
+            gradients = np.roll(gradients, -chosen.start, axis=0)
         if self._has_own_kernel:
             return gradients, self._w_lam[chosen], self._w_mu[chosen], self._slots[chosen]
         return gradients, self._weights[chosen], self._parameters, self._slots[chosen]

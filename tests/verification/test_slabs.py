@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.machine import kernel_threads, pinned_threads
+from mor_bench.mechanics import assembly
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.mechanics.slabs import N_SLABS, slabs_of
@@ -97,3 +98,27 @@ def test_answers_on_several_threads_are_the_same_bit_by_bit(
             size = np.abs(usual[name]).max()
             tolerance = 1e-6 if name == "answer" else 1e-12
             np.testing.assert_allclose(values, usual[name], 0, tolerance * size, err_msg=name)
+
+
+def test_slabs_of_a_box_of_tetrahedra_use_the_gradients_of_their_own_cells(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Three batches of gradients repeat, and most slabs do not begin with the first of them."""
+    scene = mor_bench.load_scene(
+        {
+            "geometry": {"shape": "box", "size_m": [1.3, 1.1, 0.9], "cells": [15, 15, 13]},
+            "discretisation": {"element": "tetrahedron"},
+            "material": {"law": "saint-venant-kirchhoff", "young_pa": 500.0, "poisson": 0.3},
+            "supports": [{"region": "x-min"}],
+        }
+    )
+    q = 1e-3 * np.random.default_rng(0).normal(size=len(scene.free_dofs))
+    model = FullOrderModel(scene)
+    assert model.assembler.in_slabs
+    state, tangent = model.linearise(q)
+    monkeypatch.setattr(assembly, "PARALLEL_FROM", 10**9)
+    whole = FullOrderModel(scene)
+    assert not whole.assembler.in_slabs
+    expected, values = whole.linearise(q)
+    np.testing.assert_allclose(state.force, expected.force, atol=1e-12 * abs(expected.force).max())
+    np.testing.assert_allclose(tangent, values, atol=1e-12 * abs(values).max())
