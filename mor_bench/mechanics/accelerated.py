@@ -51,8 +51,7 @@ class Probes:
 
     The first probe is the rotated response to a random force, which soft modes dominate. Each next
     probe is P⁻¹K of the previous one, as in Lanczos' method. Products with K are differences of
-    the internal force. The probes suffice when their lowest curvature
-    relative to P has settled.
+    the internal force. The probes suffice when their lowest curvature relative to P has settled.
     """
 
     def __init__(self, problem: Problem) -> None:

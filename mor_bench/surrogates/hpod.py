@@ -62,27 +62,37 @@ class HyperReducedPOD(CubatureSurrogate):
         cells = np.flatnonzero(weights)
         if self.sampling == "cells":
             return {"cells": cells, "weights": weights[cells]}
-        on_nodes = nodal(next(states())[0].scene, modes)
-        target = np.concatenate([_forces(model, modes, q).ravel() for model, q in states()])
-
-        def integrands(chosen: NDArray[np.int64], positions: Array | None = None) -> Array:
-            own = []
-            for model, q in states():
-                rule = chosen, np.ones(len(chosen)), on_nodes
-                points = reduced_points(model.scene, *rule, positions=positions)
-                own += [points.point_forces(row) for row in q]
-            return np.concatenate(own, axis=1)
-
-        both = triangle(np.column_stack([integrands(cells).T, target]))
+        own, targets = [], []
+        for model, q in states():
+            on_nodes = nodal(model.scene, modes)
+            points = reduced_points(model.scene, cells, np.ones(len(cells)), on_nodes)
+            own += [points.point_forces(row).T for row in q]
+            targets.append(_forces(model, modes, q).ravel())
+        target = np.concatenate(targets)
+        both = triangle(np.column_stack([np.concatenate(own), target]))
         factors = sparse_nnls(
             np.ascontiguousarray(both[:, :-1]), both[:, -1], tolerance
         ).weights.reshape(len(cells), -1)
         if self.sampling == "moved":
-            scene, (cell, point) = next(states())[0].scene, np.nonzero(factors)
+            cell, point = np.nonzero(factors)
             start = PointRule(cells[cell], GAUSS[point], factors[cell, point])
-            return vars(move_points(scene.mesh, integrands, target, start, tolerance))
+            return vars(_moved(states, modes, target, start, tolerance))
         used = factors.any(axis=1)
         return {"cells": cells[used], "weights": factors[used]}
+
+
+def _moved(
+    states: States, modes: Array, target: Array, start: PointRule, tolerance: float
+) -> PointRule:
+    """Return a rule with moved points for the states of a single body, see `move_points`."""
+    ((model, q),) = states()
+    scene, on_nodes = model.scene, nodal(model.scene, modes)
+
+    def integrands(cells: NDArray[np.int64], positions: Array) -> Array:
+        points = reduced_points(scene, cells, np.ones(len(cells)), on_nodes, positions=positions)
+        return np.concatenate([points.point_forces(row) for row in q], axis=1)
+
+    return move_points(scene.mesh, integrands, target, start, tolerance)
 
 
 def _forces(model: FullOrderModel, modes: Array, q: Array) -> Array:

@@ -21,7 +21,6 @@ from tests.published.cost_tables import (
     probe_cost,
     scaling,
 )
-from tests.published.front_tables import fronts
 from tests.published.literature_table import literature
 from tests.published.network_size_tables import (
     network_size_law,
@@ -366,7 +365,6 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "network-sizes": network_sizes,
     "network-size-law": network_size_law,
     "paper-size": paper_size,
-    "fronts": fronts,
     "paper-size-latency": paper_size_latency,
     "paper-amplitude": paper_amplitude,
     "records": records,
