@@ -95,6 +95,10 @@ class OperatorSurrogate(FieldSurrogate):
 
         return loss
 
+    @property
+    def repeats(self) -> bool:
+        return True
+
     def plan(self) -> TrainingPlan:
         return TrainingPlan(
             self.iterations,

@@ -11,9 +11,13 @@ command continues after an interruption.
 from __future__ import annotations
 
 import json
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
+from threading import Lock
 from time import process_time
 from typing import Annotated, Any
 
@@ -32,8 +36,15 @@ METHODS: dict[str, dict[str, Any]] = {
     "autoencoder": {},
     "pod-deeponet": LINEAR_RESPONSE,
     "deeponet": LINEAR_RESPONSE,
+    "umesh-linear": {},
+    "fno": LINEAR_RESPONSE,
+    "transolver": LINEAR_RESPONSE,
+    "graph-u-net": LINEAR_RESPONSE,
+    "mesh-graph-net": LINEAR_RESPONSE,
 }
 """Methods, and parameters that replace those of their files."""
+
+BY_DEFAULT = ["pod-nn", "autoencoder", "pod-deeponet", "deeponet"]
 
 SHARES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Numbers of iterations, relative to those of the method's file."""
@@ -42,8 +53,42 @@ SAMPLES = (64, 256, 1024)
 SEEDS = (0, 1, 2)
 FLAT = 0.05
 """Fall of the validation error by a doubling of the iterations below which a curve is flat."""
-MOST_CORE_S = 120.0
-"""Longest training, in core-seconds, as the one before it predicts."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A training: all but the seed says where it stands on a curve."""
+
+    method: str
+    n_train: int
+    iterations: int
+    seed: int = 0
+
+
+@cache
+def dataset_of(name: str) -> Dataset:
+    return mor_bench.load_dataset(name)
+
+
+def trained(dataset: str, wanted: Point) -> dict[str, Any]:
+    """Return a point with its core-seconds and its errors of validation and test."""
+    data = dataset_of(dataset)
+    parameters = METHODS[wanted.method]
+    train = data.train[: wanted.n_train]
+    with pinned_threads(1):
+        # Kernels are compiled before the training that is timed.
+        mor_bench.load_method(wanted.method, **parameters, iterations=1).fit(data.scene, train[:64])
+        made = mor_bench.load_method(
+            wanted.method, **parameters, iterations=wanted.iterations, seed=wanted.seed
+        )
+        begun = process_time()
+        made.fit(data.scene, train)
+        return {
+            **vars(wanted),
+            "core_s": process_time() - begun,
+            "validation": scored(made, data.validation),
+            "test": scored(made, data.test),
+        }
 
 
 @dataclass
@@ -52,80 +97,89 @@ class Curves:
 
     Attributes
     ----------
-    data : Dataset
+    dataset : str
     file : Path
+    trainings : Executor
+        Trains the points, each in one process.
+    most_core_s : float
+        Longest training, in core-seconds, as the one before it predicts.
     points : list of dict
         Method, samples, iterations, seed, core-seconds, and errors of validation and test.
     """
 
-    data: Dataset
+    dataset: str
     file: Path
+    trainings: Executor
+    most_core_s: float
     points: list[dict[str, Any]] = field(default_factory=list)
+    lock: Lock = field(default_factory=Lock)
 
     def read(self) -> None:
         """Take the points of the file, if it exists."""
         if self.file.exists() and self.file.stat().st_size:
             self.points = json.loads(self.file.read_text(encoding="utf-8"))["points"]
 
-    def point(self, method: str, n_train: int, iterations: int, seed: int) -> dict[str, Any]:
-        """Return one point; train for it unless it is known."""
-        key = {"method": method, "n_train": n_train, "iterations": iterations, "seed": seed}
-        for known in self.points:
-            if key.items() <= known.items():
-                return known
-        made = mor_bench.load_method(method, **METHODS[method], iterations=iterations, seed=seed)
-        with pinned_threads(1):
-            begun = process_time()
-            made.fit(self.data.scene, self.data.train[:n_train])
-            found: dict[str, Any] = {
-                **key,
-                "core_s": process_time() - begun,
-                "validation": scored(made, self.data.validation),
-                "test": scored(made, self.data.test),
-            }
-        self.points.append(found)
-        print(
-            key, f"{found['core_s']:.0f} core-s", f"{found['test']['mean_dof_m']:.3g} m", flush=True
-        )
-        content = {"dataset": self.data.scene.name, "points": self.points}
-        write_atomically(self.file, (json.dumps(content, indent=1) + "\n").encode())
-        return found
+    def of_all_seeds(self, method: str, n_train: int, iterations: int) -> list[dict[str, Any]]:
+        """Return the points of all seeds; train for those that are not known."""
+        wanted = [Point(method, n_train, iterations, seed) for seed in SEEDS]
+        unknown = [one for one in wanted if self._known(one) is None]
+        running = [self.trainings.submit(trained, self.dataset, one) for one in unknown]
+        for one in running:
+            self._add(one.result())
+        return [found for one in wanted if (found := self._known(one)) is not None]
 
-    def median_of(self, method: str, n_train: int, iterations: int) -> tuple[float, float]:
-        """Return the medians over the seeds of the validation error, m, and of the core-seconds."""
-        found = [self.point(method, n_train, iterations, seed) for seed in SEEDS]
-        errors = [point["validation"]["mean_dof_m"] for point in found]
-        return median(errors), median(point["core_s"] for point in found)
+    def _known(self, wanted: Point) -> dict[str, Any] | None:
+        with self.lock:
+            return next((p for p in self.points if vars(wanted).items() <= p.items()), None)
 
-    def iterate(self, method: str, usual: int) -> None:
+    def _add(self, found: dict[str, Any]) -> None:
+        with self.lock:
+            self.points.append(found)
+            content = {"dataset": self.dataset, "points": self.points}
+            write_atomically(self.file, (json.dumps(content, indent=1) + "\n").encode())
+        names = [str(found[name]) for name in ("method", "n_train", "iterations", "seed")]
+        error = f"{found['test']['mean_dof_m']:.3g} m"
+        print(*names, f"{found['core_s']:.0f} core-s", error, flush=True)
+
+    def iterate(self, method: str, n_train: int, usual: int) -> None:
         """Double the iterations until the curve is flat or the limit is met."""
-        before, n_train = float("inf"), len(self.data.train)
+        before = float("inf")
         for share in SHARES:
-            error, core_s = self.median_of(method, n_train, round(share * usual))
-            if error > (1 - FLAT) * before or 2 * core_s > MOST_CORE_S:
-                return
+            found = self.of_all_seeds(method, n_train, round(share * usual))
+            error = median(point["validation"]["mean_dof_m"] for point in found)
+            core_s = median(point["core_s"] for point in found)
+            if error > (1 - FLAT) * before or 2 * core_s > self.most_core_s:
+                break
             before = error
+        self.of_all_seeds(method, n_train, usual)
 
 
 def main(
     dataset: Annotated[str, typer.Option(help="Name or TOML file.")] = "beam-coarse",
+    method: Annotated[list[str], typer.Option(help="One of METHODS.")] = BY_DEFAULT,
+    most_core_s: Annotated[float, typer.Option(help="Longest training, core-seconds.")] = 120.0,
+    jobs: Annotated[int, typer.Option(help="Trainings side by side.")] = 1,
     report: Annotated[
         Path,
         typer.Option("--json", metavar="FILE", help="Write points here, and keep those in it."),
     ] = Path("learning-curves.json"),
 ) -> None:
     """Measure errors of networks over numbers of iterations and of training samples."""
-    curves = Curves(mor_bench.load_dataset(dataset), report)
-    curves.read()
-    for method in METHODS:
-        # Kernels are compiled before the first training that is timed.
-        mor_bench.load_method(method, **METHODS[method], iterations=1).fit(
-            curves.data.scene, curves.data.train[: SAMPLES[0]]
-        )
-        usual = int(load_method_spec(method).parameters["iterations"])
-        curves.iterate(method, usual)
-        for n_train in SAMPLES:
-            curves.median_of(method, n_train, usual)
+    whole = len(dataset_of(dataset).train)
+    with (
+        ProcessPoolExecutor(jobs, get_context("spawn")) as trainings,
+        ThreadPoolExecutor(jobs) as waiting,
+    ):
+        curves = Curves(dataset, report, trainings, most_core_s)
+        curves.read()
+        running = []
+        for name in method:
+            usual = int(load_method_spec(name).parameters["iterations"])
+            running.append(waiting.submit(curves.iterate, name, whole, usual))
+            for n_train in SAMPLES:
+                running.append(waiting.submit(curves.of_all_seeds, name, n_train, usual))
+        for one in running:
+            one.result()
 
 
 if __name__ == "__main__":

@@ -1,15 +1,16 @@
-"""Train U-Mesh in the paper's sizes on a graphics processor, and time its queries there.
+"""Train networks in their authors' sizes on a graphics processor, and time their queries there.
 
-    python -m tests.benchmarks.umesh_paper_size --json umesh-paper-size.json
+    python -m tests.benchmarks.full_size_networks --json umesh-paper-size.json
 
-The datasets have the paper's deformation, the split is at random, and a batch has four samples, as
-in the paper. The trainings of all scenes run side by side, each in its own stream, because one
+The datasets have the deformation of the paper of U-Mesh, the split is at random, and a batch has
+four samples, as in that paper. All trainings run side by side, each in its own stream, because one
 small batch does not fill a graphics processor. Times of queries are measured after all trainings.
 """
 
 from __future__ import annotations
 
 import json
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
@@ -30,12 +31,37 @@ from mor_bench.report.published_figures import SCENES
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.store import write_atomically
+from mor_bench.surrogates.field_network import FieldNetwork, OperatorSurrogate
 from mor_bench.training_options import TrainingOptions
 
 AT_THE_PAPERS_DEFORMATION = {
     name if name == "liver-tet" else f"{name}-paper": scene for name, scene in SCENES.items()
 }
 """Scenes of the paper, by the name of our dataset; `liver-tet` deforms less than in the paper."""
+
+UMESH = {"schedule": "one-cycle", "precision": "bfloat16", "inference": "cuda"}
+OTHERS: dict[str, dict[str, Any]] = {
+    "mesh-graph-net": {
+        "width": 128,
+        "steps": 15,
+        "hidden_layers": 2,
+        "batch_size": 4,
+        "learning_rate": 1e-3,
+    },
+    "graph-u-net": {"width": 128, "levels": 3, "steps": 2, "batch_size": 4, "learning_rate": 1e-3},
+    "transolver": {
+        "width": 128,
+        "heads": 8,
+        "slices": 64,
+        "layers": 8,
+        "batch_size": 4,
+        "learning_rate": 1e-3,
+    },
+}
+"""Other networks from the force, in the sizes of their authors or of their authors' code.
+
+`graph-u-net` has the width of the other graph network, and the levels of its file.
+"""
 
 SCORES = (
     "mean_dof_m",
@@ -54,10 +80,12 @@ N_QUERIES, N_WARM_UP, N_POINTS = 200, 20, 100
 
 @dataclass
 class Contestant:
-    """A scene with its network in training.
+    """A network in training on a dataset.
 
     Attributes
     ----------
+    method_name, name : str
+        Names of the method and of the dataset.
     method : Surrogate
     finished : SimpleQueue
         Receives this object when its training has ended.
@@ -69,6 +97,7 @@ class Contestant:
         What ended the training, if it did not end by itself.
     """
 
+    method_name: str
     name: str
     data: Dataset
     method: Any
@@ -91,7 +120,9 @@ class Contestant:
     def _progress(self, done: int, planned: int, loss: float) -> None:
         self.started.set()
         if done % max(1, planned // 20) == 0:
-            print(f"{self.name}: {done} of {planned}, loss {loss:.3g}", flush=True)
+            print(
+                f"{self.method_name}, {self.name}: {done} of {planned}, loss {loss:.3g}", flush=True
+            )
 
 
 def without_validation(data: Dataset) -> Snapshots:
@@ -121,31 +152,46 @@ def queries_ms(function: Any, inputs: list[Any]) -> dict[str, float]:
     return {"median": float(np.median(kept)), "p95": float(np.percentile(kept, 95))}
 
 
+def network_of(method: Any) -> Any:
+    """Return a copy of the network, without what its `precompute` has left on the processor."""
+    network = method.build_network({})
+    network.load_state_dict(method.network_.state_dict())
+    return network.eval()
+
+
 @torch.inference_mode()
 def latency(contestant: Contestant) -> dict[str, Any]:
-    """Return the times of single queries: whole ones, and the network with and without replay."""
-    method = contestant.method
-    shape = method.grid_.shape
-    given = [torch.randn(1, *shape, 3).permute(0, 4, 1, 2, 3) for _ in range(8)]
-    on_device = volumes_last(method.network_.to("cuda"))
+    """Return the times of single queries: the network with and without replay, whole ones."""
+    method, forces = contestant.method, contestant.data.test.forces[:8]
+    network = network_of(method)
+    if isinstance(network, FieldNetwork):
+        given = list(network.encode(torch.from_numpy(forces.astype(np.float32))).split(1))
+    else:
+        given = [torch.randn(1, *method.grid_.shape, 3).permute(0, 4, 1, 2, 3) for _ in forces]
+    on_device = volumes_last(deepcopy(network).to("cuda"))
 
     def launched(inputs: torch.Tensor) -> torch.Tensor:
         answer: torch.Tensor = on_device(inputs.to("cuda")).cpu()
         return answer
 
-    forces = [contestant.data.test.forces[i] for i in range(8)]
-    return {
-        "replayed": queries_ms(ReplayedNetwork(method.network_), given),
+    found = {
+        "replayed": queries_ms(ReplayedNetwork(network), given),
         "launched": queries_ms(launched, given),
-        "predict": queries_ms(method.predict, forces),
     }
+    if method.parameters.get("inference") == "cuda":
+        found["predict"] = queries_ms(method.predict, list(forces))
+    return found
 
 
 def scored(contestant: Contestant) -> dict[str, float]:
     """Return the errors of all test samples, predicted on the graphics processor."""
-    test = contestant.data.test
+    method, test = contestant.method, contestant.data.test
+    if isinstance(method, OperatorSurrogate):
+        network: Any = network_of(method).to("cuda")
+        evaluate: Any = lambda fields: network(network.encode(fields.to("cuda"))).cpu()  # noqa: E731
+        method.evaluate = evaluate  # type: ignore[method-assign]
     predicted: NDArray[np.float64] = np.concatenate(
-        [contestant.method.predict(test[i : i + 64].forces) for i in range(0, len(test), 64)]
+        [method.predict(test[i : i + 64].forces) for i in range(0, len(test), 64)]
     )
     found = summary(sample_errors(predicted, test.displacements))
     return {name: found[name] for name in SCORES}
@@ -154,13 +200,12 @@ def scored(contestant: Contestant) -> dict[str, float]:
 def row_of(contestant: Contestant) -> dict[str, Any]:
     """Return the setting of a training, its loss over the iterations, and its errors."""
     method, data = contestant.method, contestant.data
-    row: dict[str, Any] = {"dataset": contestant.name}
+    row: dict[str, Any] = {"method": contestant.method_name, "dataset": contestant.name}
     if contestant.error is not None:
         return row | {"error": repr(contestant.error)}
-    names = ("channels", "steps", "iterations", "batch_size", "learning_rate", "schedule")
     curve = method.loss_curve_[:: max(1, len(method.loss_curve_) // N_POINTS)]
     return row | {
-        **{name: getattr(method, name) for name in (*names, "precision", "seed")},
+        **method.parameters,
         "n_weights": sum(weights.numel() for weights in method.network_.parameters()),
         "n_train": len(data.train) + len(data.validation),
         "n_test": len(data.test),
@@ -171,39 +216,41 @@ def row_of(contestant: Contestant) -> dict[str, Any]:
 
 
 def contestant_of(text: str, iterations: int, finished: SimpleQueue[Contestant]) -> Contestant:
-    """Return the paper's network for a scene, from DATASET or DATASET:ITERATIONS."""
-    name, _, own = text.partition(":")
+    """Return the full-size network of [METHOD@]DATASET[:ITERATIONS], by default U-Mesh."""
+    method_name, _, rest = text.rpartition("@")
+    name, _, own = rest.partition(":")
     if name not in AT_THE_PAPERS_DEFORMATION:
         known = ", ".join(AT_THE_PAPERS_DEFORMATION)
         raise typer.BadParameter(f"a dataset must be one of {known}; got {name!r}.")
+    if method_name and method_name not in OTHERS:
+        raise typer.BadParameter(f"a method must be one of {list(OTHERS)}; got {method_name!r}.")
     network = AT_THE_PAPERS_DEFORMATION[name].network
+    umesh = {"channels": network.channels, "steps": network.steps, **UMESH}
+    method_name = method_name or "umesh"
     method = mor_bench.load_method(
-        "umesh",
-        channels=network.channels,
-        steps=network.steps,
-        iterations=int(own or iterations),
-        schedule="one-cycle",
-        precision="bfloat16",
-        inference="cuda",
+        method_name, **OTHERS.get(method_name, umesh), iterations=int(own or iterations)
     )
-    return Contestant(name, mor_bench.load_dataset(name, split="sample"), method, finished)
+    data = mor_bench.load_dataset(name, split="sample")
+    return Contestant(method_name, name, data, method, finished)
 
 
 def main(
     scenes: Annotated[
-        list[str] | None, typer.Argument(help="DATASET or DATASET:ITERATIONS; by default all.")
+        list[str] | None,
+        typer.Argument(help="[METHOD@]DATASET[:ITERATIONS]; by default U-Mesh on all datasets."),
     ] = None,
     iterations: Annotated[int, typer.Option(help="By default as in the paper.")] = 100_000,
     report: Annotated[
         Path, typer.Option("--json", metavar="FILE", help="Write the rows here.")
-    ] = Path("umesh-paper-size.json"),
+    ] = Path("full-size-networks.json"),
 ) -> None:
-    """Train U-Mesh in the paper's sizes on a graphics processor, and time its queries there."""
+    """Train networks in their full sizes on a graphics processor, and time their queries there."""
+    torch.backends.cuda.matmul.allow_tf32 = True
     finished: SimpleQueue[Contestant] = SimpleQueue()
     names = scenes or list(AT_THE_PAPERS_DEFORMATION)
-    for name in names:
-        one = contestant_of(name, iterations, finished)
-        print(f"{one.name}: {len(one.data.train)} training samples", flush=True)
+    for text in names:
+        one = contestant_of(text, iterations, finished)
+        print(f"{text}: {len(one.data.train)} training samples", flush=True)
         Thread(target=one.fit, daemon=True).start()
         one.started.wait()  # one recording at a time
     found: dict[str, Any] = {"gpu": gpu_name(), "torch": torch.__version__, "rows": []}
@@ -220,7 +267,13 @@ def main(
 
 def _write(report: Path, found: dict[str, Any]) -> None:
     row = found["rows"][-1]
-    print(row["dataset"], row.get("error") or row["test"], row.get("latency_ms"), flush=True)
+    print(
+        row["method"],
+        row["dataset"],
+        row.get("error") or row["test"],
+        row.get("latency_ms"),
+        flush=True,
+    )
     write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
 
 
