@@ -92,8 +92,7 @@ def test_a_stopped_training_resumes(
 def test_held_out_samples_and_bfloat16_and_a_given_time(data: Dataset) -> None:
     chosen = {"validation_fraction": 0.2, "precision": "bfloat16"}
     method = fitted(data, "cuda", parameters=chosen)
-    assert method.loss_curve_[-1] < method.loss_curve_[0]
-    assert len(method.validation_curve_) > 0
+    assert min(method.validation_curve_) < method.validation_curve_[0]
     timed = fitted(data, "cuda", fit_seconds=2.0)
     assert timed.iterations_ > TINY["iterations"]
 

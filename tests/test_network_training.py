@@ -43,6 +43,8 @@ class Regression:
     noise: float = 0.0
     width: int = 16
     name: str = "x"
+    by_columns: bool = False
+    """Store the weights by columns; trainings on graphics processors store some so."""
 
     def __post_init__(self) -> None:
         draw = torch.Generator().manual_seed(3)
@@ -55,6 +57,8 @@ class Regression:
         with torch.no_grad():
             for parameter in self.network.parameters():
                 parameter.copy_(torch.randn(parameter.shape, generator=draw) / 2)
+                if self.by_columns and parameter.dim() == 2:
+                    parameter.data = parameter.data.T.contiguous().T
         self.generator = draw
         self.calls = 0
 
@@ -115,11 +119,14 @@ def assert_same(one: Regression, done: Training, other: Regression, expected: Tr
     assert done.iterations == expected.iterations
 
 
+@pytest.mark.parametrize("by_columns", [False, True])
 @pytest.mark.parametrize("after", [1, 49, 50, 60])
-def test_an_interrupted_training_ends_with_the_same_bits(after: int, tmp_path: Path) -> None:
-    whole, resumed = Regression(), Regression()
+def test_an_interrupted_training_ends_with_the_same_bits(
+    after: int, by_columns: bool, tmp_path: Path
+) -> None:
+    whole, resumed = (Regression(by_columns=by_columns) for _ in range(2))
     expected = whole.train()
-    Regression().interrupted(after, tmp_path / "checkpoint")
+    Regression(by_columns=by_columns).interrupted(after, tmp_path / "checkpoint")
     done = resumed.train(checkpoint=tmp_path / "checkpoint")
     assert resumed.calls < whole.calls
     assert_same(resumed, done, whole, expected)

@@ -18,6 +18,8 @@ from mor_bench.learning.training_loop import LOSS_INTERVAL, TrainingLoop
 from mor_bench.snapshots.store import write_atomically
 
 FORMAT = "mor-bench checkpoint"
+MOMENTS = "exp_avg", "exp_avg_sq"
+"""Adam's names of its running means, which have the shapes of the weights."""
 
 
 class _Numbers(BaseModel):
@@ -112,6 +114,9 @@ def _restore(loop: TrainingLoop, numbers: _Numbers, tensors: Mapping[str, Tensor
         number: _under(f"optimiser.{number}.", tensors) for number in range(n_parameters)
     }
     loop.optimiser.load_state_dict(whole)
+    for parameter, state in loop.optimiser.state.items():  # the optimiser needs equal strides
+        for name in MOMENTS:
+            state[name] = torch.empty_like(parameter).copy_(state[name])
     loop.generator.set_state(tensors["generator"])
     loop.order, loop.rows, loop.held = (tensors[name] for name in ("order", "rows", "held"))
     loop.total = tensors["total"].to(loop.device)
@@ -176,7 +181,7 @@ def _expected_tensors(loop: TrainingLoop) -> dict[str, Tensor]:
     if loop.validated:
         expected |= _prefixed("best.", weights)
     for number, parameter in enumerate(loop.optimiser.param_groups[0]["params"]):
-        state = {"step": loop.total, "exp_avg": parameter, "exp_avg_sq": parameter}
+        state = {"step": loop.total, **dict.fromkeys(MOMENTS, parameter)}
         expected |= _prefixed(f"optimiser.{number}.", state)
     lengths = {"rows": n_rows, "held": loop.n_held, "order": n_rows - n_drawn}
     expected |= {name: loop.rows.new_empty(n) for name, n in lengths.items()}
