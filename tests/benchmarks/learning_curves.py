@@ -3,9 +3,9 @@
     python -m tests.benchmarks.learning_curves --json learning-curves.json
 
 Every point is a training of its own, with its own learning-rate schedule. The iterations double
-until a doubling lowers the error on validation samples by less than 5 %, or until a training would
-take longer than the limit. Points that the file has already are not trained again, so that the same
-command continues after an interruption.
+until two doublings in a row each lower the error on validation samples by less than 5 %, or until a
+training would take longer than the limit. Points that the file has already are not trained again,
+so that the same command continues after an interruption.
 """
 
 from __future__ import annotations
@@ -142,13 +142,14 @@ class Curves:
         print(*names, f"{found['core_s']:.0f} core-s", error, flush=True)
 
     def iterate(self, method: str, n_train: int, usual: int) -> None:
-        """Double the iterations until the curve is flat or the limit is met."""
-        before = float("inf")
+        """Double the iterations until the curve stays flat or the limit is met."""
+        before, n_flat = float("inf"), 0
         for share in SHARES:
             found = self.of_all_seeds(method, n_train, round(share * usual))
             error = median(point["validation"]["mean_dof_m"] for point in found)
             core_s = median(point["core_s"] for point in found)
-            if error > (1 - FLAT) * before or 2 * core_s > self.most_core_s:
+            n_flat = n_flat + 1 if error > (1 - FLAT) * before else 0
+            if n_flat == 2 or 2 * core_s > self.most_core_s:
                 break
             before = error
         self.of_all_seeds(method, n_train, usual)
