@@ -155,7 +155,7 @@ def queries_ms(function: Any, inputs: list[Any]) -> dict[str, float]:
 def network_of(method: Any) -> Any:
     """Return a copy of the network, without what its `precompute` has left on the processor."""
     network = method.build_network({})
-    network.load_state_dict(method.network_.state_dict())
+    network.load_state_dict(method.network_.state_dict(), assign=True)
     return network.eval()
 
 

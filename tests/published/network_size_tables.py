@@ -21,6 +21,14 @@ PAPER_E_M = next(
 )
 """Mean error on the coarse beam in the paper, for the network that is extrapolated to, m."""
 
+SIZES = {
+    "umesh": ("channels", "steps"),
+    "mesh-graph-net": ("width", "steps"),
+    "graph-u-net": ("width", "levels", "steps"),
+    "transolver": ("width", "layers", "heads", "slices"),
+}
+"""Parameters that set the size of a network, by method."""
+
 FLAT = 0.05
 """Fall of e by the last doubling of the iterations below which a training counts as converged."""
 
@@ -71,9 +79,12 @@ def network_size_law(source: str) -> str:
 
 
 def paper_size(source: str) -> str:
-    """Show the errors of the paper's networks, trained here, beside those of the paper."""
+    """Show the errors of the paper's networks, trained here, beside those of the paper.
+
+    SOURCE is FILE,FILE,….
+    """
     body = []
-    for row in content_of(source)["rows"]:
+    for row in _rows_of(source):
         test, paper = row["test"], _published(row)
         body.append(
             [
@@ -106,6 +117,35 @@ def paper_size_latency(source: str) -> str:
         body.append([row["dataset"], f"{row['n_weights']:,}", *cells, published])
     headings = ["dataset", "weights", "whole query, ms", "network, replayed, ms"]
     return markdown([*headings, "network, launched by PyTorch, ms", "paper's query, ms"], body)
+
+
+def full_sizes(source: str, dataset: str) -> str:
+    """Show full-size networks on one dataset, the most accurate first; SOURCE is FILE,FILE,…."""
+    rows = [row for row in _rows_of(source) if row["dataset"] == dataset]
+    body = []
+    for row in sorted(rows, key=lambda row: float(row["test"]["mean_dof_m"])):
+        test, method = row["test"], row.get("method", "umesh")
+        times = [number(row["latency_ms"][name]["median"]) for name in ("replayed", "launched")]
+        body.append(
+            [
+                f"`{method}`",
+                ", ".join(f"{name} {row[name]}" for name in SIZES[method]),
+                f"{row['n_weights']:,}",
+                f"{row['iterations']:,}",
+                number(row["fit_s"]),
+                *(_metres(test[name]) for name in ("mean_dof_m", "std_dof_m", "max_dof_m")),
+                " / ".join(number(100 * test[f"rel_l2_{name}"]) for name in ("median", "p95")),
+                number(100 * test["tip_rel_at_largest"]),
+                " / ".join(times),
+            ]
+        )
+    headings = ["method", "size", "weights", "iterations", "trained, s", "ē, m", "σ(e), m"]
+    headings += ["largest e, m", "relative L2 error, %: median / p95", "tip at largest u, %"]
+    return markdown([*headings, "network, replayed / launched by PyTorch, ms"], body)
+
+
+def _rows_of(source: str) -> Rows:
+    return [row for name in source.split(",") for row in content_of(name)["rows"]]
 
 
 def _published(row: dict[str, Any]) -> Published:

@@ -25,6 +25,7 @@ from tests.published.literature_table import literature
 from tests.published.network_size_tables import (
     network_size_law,
     network_sizes,
+    full_sizes,
     paper_size,
     paper_size_latency,
 )
@@ -364,6 +365,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "choices-decided": choices_decided,
     "network-sizes": network_sizes,
     "network-size-law": network_size_law,
+    "full-sizes": full_sizes,
     "paper-size": paper_size,
     "paper-size-latency": paper_size_latency,
     "paper-amplitude": paper_amplitude,
