@@ -43,8 +43,7 @@ class Regression:
     noise: float = 0.0
     width: int = 16
     name: str = "x"
-    by_columns: bool = False
-    """Store the weights by columns; trainings on graphics processors store some so."""
+    by_columns: bool = False  # weights, as some are on a graphics processor
 
     def __post_init__(self) -> None:
         draw = torch.Generator().manual_seed(3)
