@@ -87,8 +87,15 @@ class Multigrid:
 class MultigridFactor:
     """A multigrid hierarchy.
 
-    W-cycles in float32 are the preconditioner, the more the less compressible the material is. A
-    solve uses conjugate gradients with it.
+    Cycles in float32 are the preconditioner; the less compressible the material, the more. A solve
+    uses conjugate gradients with it.
+
+    Attributes
+    ----------
+    n_cycles : int
+        Cycles on the finest level per back-solve.
+    place : (n,) int64
+        Position of each unknown in the order of `solve_in_place`.
     """
 
     def __init__(
@@ -119,7 +126,7 @@ class MultigridFactor:
                 improve_candidates=None,
                 max_coarse=COARSEST,
             ).levels
-            self._inverse, self._n_cycles = inverse_of(hierarchy, dtype)
+            self._inverse, self.n_cycles = inverse_of(hierarchy, dtype)
             response = self._inverse(np.ones(pattern.whole.n, dtype))
             if np.isfinite(response).all() and response.sum() > 0:
                 break
@@ -156,7 +163,7 @@ class MultigridFactor:
         matrix, inverse = (
             sp_linalg.LinearOperator((n, n), apply, dtype=np.float64) for apply in (product, cycles)
         )
-        iterations = -(-MAX_CYCLES // self._n_cycles)
+        iterations = -(-MAX_CYCLES // self.n_cycles)
         solution, failed = sp_linalg.cg(
             matrix, rhs / scale, rtol=CYCLE_TOLERANCE, maxiter=iterations, M=inverse
         )
