@@ -41,7 +41,8 @@ def lowest_eigenvalue(cycle: Cycle) -> float:
         share = rz / before
         p, Kp = z + share * p, Kz + share * Kp
         curvature = float(p @ Kp)
-        if not (rz > 0.0 and curvature > 0.0):  # not definite in single precision
+        # The matrix of an ill-conditioned body may not be definite in single precision.
+        if not (0.0 < rz < np.inf and 0.0 < curvature < np.inf):
             break
         shares.append(share)
         lengths.append(rz / curvature)
