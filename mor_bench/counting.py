@@ -30,8 +30,8 @@ class Cost:
         Factorised matrices of any size; `multiply_adds` depends on their size. Inverses of 3x3
         blocks do not count.
     back_solves : int
-        Right-hand sides solved with both triangular factors of a matrix of any size, or by one
-        multigrid cycle. A sweep over eight right-hand sides counts as eight.
+        Right-hand sides solved with both triangular factors of a matrix of any size, or
+        approximately by multigrid cycles. A sweep over eight right-hand sides counts as eight.
     reduced_factorisations, reduced_back_solves : int
         The part of the above with dense matrices of a reduced basis. The rest has sparse matrices
         of a mesh.

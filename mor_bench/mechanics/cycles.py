@@ -1,9 +1,8 @@
 """Multigrid cycles on symmetric matrices of 3x3 blocks, of which only the lower half is stored.
 
-A cycle starts from zero: one forward sweep of block Gauss-Seidel, the correction of the next level,
-and one backward sweep. Each sweep reads half of the matrix once, since a block also acts
-transposed. The correction is that of two cycles of the next level (a W-cycle): with one, the
-iterations grow with the number of levels. The coarsest level has an explicit inverse.
+A cycle starts from zero: one forward sweep of damped block Gauss-Seidel, the correction of the next
+level, and one backward sweep. Each sweep reads half of the matrix once, since a block also acts
+transposed. The coarsest level has an explicit inverse.
 
 Trottenberg, Oosterlee & Schüller, "Multigrid", Academic Press, 2001, section 2.4.
 """
@@ -11,7 +10,7 @@ Trottenberg, Oosterlee & Schüller, "Multigrid", Academic Press, 2001, section 2
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,13 +21,16 @@ from mor_bench.mechanics.slabs import Slabs, are_apart, slabs_of, whole
 
 Floats = NDArray[np.floating[Any]]
 
-VISITS = 2
-"""Cycles of the next level in a cycle."""
+RELAXATION = 0.75
+"""Damping of the sweeps.
+
+Undamped sweeps need 10 % more iterations at a Poisson's ratio of 0.4, and 20 % more at 0.49.
+"""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def sweep_forward(indptr, indices, starts, blocks, b, x, r, first, last):
-    """Solve rows of (L + D) x = b, and add the residual b - (L + D + Lᵀ) x = -Lᵀ x to r."""
+    """Solve rows of (L + D / RELAXATION) x = b, and add b - (L + D + Lᵀ) x to r."""
     for i in range(first, last):
         begin, n = indptr[i], indptr[i + 1] - indptr[i]
         row = blocks[starts[i] : starts[i] + n + 2]
@@ -44,6 +46,10 @@ def sweep_forward(indptr, indices, starts, blocks, b, x, r, first, last):
         x1 = D[1, 0] * s0 + D[1, 1] * s1 + D[1, 2] * s2
         x2 = D[2, 0] * s0 + D[2, 1] * s1 + D[2, 2] * s2
         x[3 * i], x[3 * i + 1], x[3 * i + 2] = x0, x1, x2
+        D = row[n]
+        r[3 * i] += s0 - (D[0, 0] * x0 + D[0, 1] * x1 + D[0, 2] * x2)
+        r[3 * i + 1] += s1 - (D[1, 0] * x0 + D[1, 1] * x1 + D[1, 2] * x2)
+        r[3 * i + 2] += s2 - (D[2, 0] * x0 + D[2, 1] * x1 + D[2, 2] * x2)
         for k in range(n):
             K, j = row[k], 3 * indices[begin + k]
             r[j] -= K[0, 0] * x0 + K[1, 0] * x1 + K[2, 0] * x2
@@ -53,7 +59,7 @@ def sweep_forward(indptr, indices, starts, blocks, b, x, r, first, last):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def sweep_backward(indptr, indices, starts, blocks, b, x, above, first, last):
-    """Improve x by one sweep of block Gauss-Seidel over rows, from the last to the first.
+    """Improve x by one damped sweep of block Gauss-Seidel over rows, from the last to the first.
 
     Lᵀ x of the new x is added to ``above``.
     """
@@ -68,10 +74,16 @@ def sweep_backward(indptr, indices, starts, blocks, b, x, above, first, last):
             s0 -= K[0, 0] * x0 + K[0, 1] * x1 + K[0, 2] * x2
             s1 -= K[1, 0] * x0 + K[1, 1] * x1 + K[1, 2] * x2
             s2 -= K[2, 0] * x0 + K[2, 1] * x1 + K[2, 2] * x2
+        D, x0, x1, x2 = row[n], x[3 * i], x[3 * i + 1], x[3 * i + 2]
+        s0, s1, s2 = (
+            s0 - (D[0, 0] * x0 + D[0, 1] * x1 + D[0, 2] * x2),
+            s1 - (D[1, 0] * x0 + D[1, 1] * x1 + D[1, 2] * x2),
+            s2 - (D[2, 0] * x0 + D[2, 1] * x1 + D[2, 2] * x2),
+        )
         D = row[n + 1]
-        x0 = D[0, 0] * s0 + D[0, 1] * s1 + D[0, 2] * s2
-        x1 = D[1, 0] * s0 + D[1, 1] * s1 + D[1, 2] * s2
-        x2 = D[2, 0] * s0 + D[2, 1] * s1 + D[2, 2] * s2
+        x0 += D[0, 0] * s0 + D[0, 1] * s1 + D[0, 2] * s2
+        x1 += D[1, 0] * s0 + D[1, 1] * s1 + D[1, 2] * s2
+        x2 += D[2, 0] * s0 + D[2, 1] * s1 + D[2, 2] * s2
         x[3 * i], x[3 * i + 1], x[3 * i + 2] = x0, x1, x2
         for k in range(n):
             K, j = row[k], 3 * indices[begin + k]
@@ -81,13 +93,12 @@ def sweep_backward(indptr, indices, starts, blocks, b, x, above, first, last):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def subtract_product(indptr, indices, starts, blocks, x, r):
-    """Subtract (L + D + Lᵀ) x from r."""
-    for i in range(len(indptr) - 1):
+def complete_product(indptr, indices, starts, blocks, x, product, first, last):
+    """Add rows of (L + D) x to Lᵀ x, which a backward sweep leaves."""
+    for i in range(first, last):
         begin, n = indptr[i], indptr[i + 1] - indptr[i]
         row = blocks[starts[i] : starts[i] + n + 1]
-        D = row[n]
-        x0, x1, x2 = x[3 * i], x[3 * i + 1], x[3 * i + 2]
+        D, x0, x1, x2 = row[n], x[3 * i], x[3 * i + 1], x[3 * i + 2]
         s0 = D[0, 0] * x0 + D[0, 1] * x1 + D[0, 2] * x2
         s1 = D[1, 0] * x0 + D[1, 1] * x1 + D[1, 2] * x2
         s2 = D[2, 0] * x0 + D[2, 1] * x1 + D[2, 2] * x2
@@ -97,12 +108,9 @@ def subtract_product(indptr, indices, starts, blocks, x, r):
             s0 += K[0, 0] * y0 + K[0, 1] * y1 + K[0, 2] * y2
             s1 += K[1, 0] * y0 + K[1, 1] * y1 + K[1, 2] * y2
             s2 += K[2, 0] * y0 + K[2, 1] * y1 + K[2, 2] * y2
-            r[j] -= K[0, 0] * x0 + K[1, 0] * x1 + K[2, 0] * x2
-            r[j + 1] -= K[0, 1] * x0 + K[1, 1] * x1 + K[2, 1] * x2
-            r[j + 2] -= K[0, 2] * x0 + K[1, 2] * x1 + K[2, 2] * x2
-        r[3 * i] -= s0
-        r[3 * i + 1] -= s1
-        r[3 * i + 2] -= s2
+        product[3 * i] += s0
+        product[3 * i + 1] += s1
+        product[3 * i + 2] += s2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -156,7 +164,7 @@ class Level:
     ----------
     lower : tuple of arrays
         Rows left of the diagonal. Behind the blocks of a row are that of the diagonal, and its
-        inverse.
+        inverse times `RELAXATION`.
     prolongation : tuple of arrays
         Rows of P.
     n_coarse : int
@@ -174,9 +182,14 @@ class Level:
 
     @property
     def multiply_adds(self) -> int:
-        """Work of the sweeps and transfers of one visit, and of the residual between two."""
+        """Work of the two sweeps and the transfers of a cycle."""
         n, lower, P = len(self.lower[2]), 9 * len(self.lower[1]), 9 * len(self.prolongation[1])
-        return 6 * lower + 27 * n + 2 * P
+        return 4 * lower + 36 * n + 2 * P
+
+    @property
+    def product_multiply_adds(self) -> int:
+        """Work of completing a product with the level's matrix."""
+        return 9 * (len(self.lower[1]) + len(self.lower[2]))
 
 
 def _stored_once(counts: NDArray[np.int64], blocks: Floats) -> tuple[NDArray[np.int32], Floats]:
@@ -238,7 +251,8 @@ def level_of(matrix: Any, prolongation: Any, dtype: Any) -> Level:
     begins, stored = _stored_once(counts + 2, blocks)
     diagonals = np.unique(begins + counts)
     # An aggregate of one or two nodes has fewer than six motions; the others have zero rows.
-    stored[diagonals + 1] = np.linalg.pinv(stored[diagonals], rcond=1e-10, hermitian=True)
+    inverses = np.linalg.pinv(stored[diagonals], rcond=1e-10, hermitian=True)
+    stored[diagonals + 1] = RELAXATION * inverses
     P = sp.csr_matrix(prolongation).tobsr(blocksize=(3, 3))
     P.sort_indices()
     P_begins, P_stored = _stored_once(np.diff(P.indptr), P.data)
@@ -259,44 +273,74 @@ def level_of(matrix: Any, prolongation: Any, dtype: Any) -> Level:
     )
 
 
-class Cycle:
-    """A W-cycle, an approximate inverse of the finest matrix.
+class Inverse(Protocol):
+    """An exact or approximate inverse of a symmetric matrix."""
 
-    Parameters
-    ----------
-    levels : list of Level
-        From the finest to the one above the coarsest.
-    coarsest : (n, n) floats
-        Inverse of the coarsest matrix.
-    """
+    @property
+    def multiply_adds(self) -> int: ...
+    def __call__(self, b: Floats) -> Floats: ...
 
-    def __init__(self, levels: list[Level], coarsest: Floats) -> None:
-        self._levels, self._coarsest, self.dtype = levels, coarsest, coarsest.dtype
+
+@dataclass(frozen=True)
+class Exact:
+    """The inverse (n, n) itself, of the coarsest matrix."""
+
+    matrix: Floats
 
     @property
     def multiply_adds(self) -> int:
-        visits = [VISITS**depth for depth in range(len(self._levels) + 1)]
-        own = [level.multiply_adds for level in self._levels] + [self._coarsest.size]
-        return int(np.dot(visits, own))
+        return self.matrix.size
 
-    def __call__(self, b: Floats, depth: int = 0) -> Floats:
-        """Return the correction for a residual of the level at this depth."""
-        if depth == len(self._levels):
-            return np.asarray(self._coarsest @ b)
-        level = self._levels[depth]
+    def __call__(self, b: Floats) -> Floats:
+        return np.asarray(self.matrix @ b)
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """A cycle, an approximate inverse of the matrix K of a level.
+
+    All eigenvalues of (cycle) K are in (0, 1] if those of ``coarse`` and its matrix are.
+
+    Parameters
+    ----------
+    level : Level
+    coarse : Inverse
+        An approximate inverse of the next level's matrix.
+    """
+
+    level: Level
+    coarse: Inverse
+
+    @property
+    def n(self) -> int:
+        """Number of rows of K."""
+        return 3 * len(self.level.lower[2])
+
+    @property
+    def multiply_adds(self) -> int:
+        return self.level.multiply_adds + self.coarse.multiply_adds
+
+    def __call__(self, b: Floats) -> Floats:
+        """Return the correction x (n,) for a residual b (n,)."""
+        return self._correction(b)[0]
+
+    def with_product(self, b: Floats) -> tuple[Floats, Floats]:
+        """Return the correction x (n,) for a residual b (n,), and K x (n,)."""
+        x, product = self._correction(b)
+        lower = self.level.lower
+        self.level.slabs.run_all(lambda *rows: complete_product(*lower, x, product, *rows))
+        return x, product
+
+    def _correction(self, b: Floats) -> tuple[Floats, Floats]:
+        """Return x (n,), and Lᵀ x (n,)."""
+        level = self.level
         x, left, above = np.empty_like(b), np.zeros_like(b), np.zeros_like(b)
         coarse = np.zeros(level.n_coarse, dtype=b.dtype)
         level.slabs.run(lambda *rows: sweep_forward(*level.lower, b, x, left, *rows))
         level.restriction.run(lambda *rows: restrict(*level.prolongation, left, coarse, *rows))
-        found = self(coarse, depth + 1)
-        if depth + 1 < len(self._levels):
-            below = self._levels[depth + 1]
-            for _ in range(VISITS - 1):
-                left_below = coarse.copy()
-                subtract_product(*below.lower, found, left_below)
-                found += self(left_below, depth + 1)
+        found = self.coarse(coarse)
         level.slabs.run_all(lambda *rows: prolong(*level.prolongation, found, x, *rows))
         level.slabs.run(
             lambda *rows: sweep_backward(*level.lower, b, x, above, *rows), backward=True
         )
-        return x
+        return x, above

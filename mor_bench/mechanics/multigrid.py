@@ -11,7 +11,8 @@ from scipy.sparse import linalg as sp_linalg
 
 from mor_bench.counting import count
 from mor_bench.errors import SolverError
-from mor_bench.mechanics.cycles import Cycle, level_of
+from mor_bench.mechanics.chebyshev import Chebyshev, cycles_for, lowest_eigenvalue
+from mor_bench.mechanics.cycles import Cycle, Exact, Inverse, level_of
 from mor_bench.mechanics.pattern import Pattern
 from mor_bench.mechanics.rotated import multiply
 
@@ -19,9 +20,37 @@ CYCLE_TOLERANCE = 1e-12
 """Relative residual of a solve by multigrid."""
 ACCEPTED_RESIDUAL = 1e-8
 """Relative residual that is accepted where round-off prevents a smaller one."""
-MAX_CYCLES = 300
+MAX_CYCLES = 1000
 COARSEST = 200
 """Largest number of aggregates on the coarsest level, whose matrix is inverted."""
+REDUCTION = 0.3
+"""Factor by which an approximate solution reduces every error at least; it sets the cycles.
+
+An exact inverse would hardly save iterations, because the tangent differs from the matrix.
+"""
+COARSE_CYCLES = 2
+"""Cycles on each coarser level: with one, iterations grow with the number of levels."""
+
+
+def inverse_of(hierarchy: list[Any], dtype: Any) -> tuple[Inverse, int]:
+    """Return the approximate inverse of the finest matrix, and its number of cycles.
+
+    Parameters
+    ----------
+    hierarchy : list of pyamg levels
+        With matrices ``A`` and prolongations ``P``, the finest first.
+    dtype : NumPy type
+    """
+    coarsest = hierarchy[-1].A.toarray().astype(np.float64)
+    inverse: Inverse = Exact(np.linalg.pinv(coarsest, rcond=1e-14, hermitian=True).astype(dtype))
+    n_cycles = 1
+    for level in reversed(hierarchy[:-1]):
+        cycle = Cycle(level_of(level.A, level.P, dtype), inverse)
+        lowest = lowest_eigenvalue(cycle)
+        finest = level is hierarchy[0]
+        n_cycles = cycles_for(lowest, REDUCTION) if finest else COARSE_CYCLES
+        inverse = Chebyshev(cycle, lowest, n_cycles)
+    return inverse, n_cycles
 
 
 class Multigrid:
@@ -58,7 +87,15 @@ class Multigrid:
 class MultigridFactor:
     """A multigrid hierarchy.
 
-    One W-cycle in float32 is the preconditioner. A solve uses conjugate gradients with it.
+    Cycles in float32 are the preconditioner; the less compressible the material, the more. A solve
+    uses conjugate gradients with it.
+
+    Attributes
+    ----------
+    n_cycles : int
+        Cycles on the finest level per back-solve.
+    place : (n,) int64
+        Position of each unknown in the order of `solve_in_place`.
     """
 
     def __init__(
@@ -89,23 +126,20 @@ class MultigridFactor:
                 improve_candidates=None,
                 max_coarse=COARSEST,
             ).levels
-            coarsest = hierarchy[-1].A.toarray().astype(np.float64)
-            self._cycle = Cycle(
-                [level_of(level.A, level.P, dtype) for level in hierarchy[:-1]],
-                np.linalg.pinv(coarsest, rcond=1e-14, hermitian=True).astype(dtype),
-            )
-            response = self._cycle(np.ones(pattern.whole.n, dtype))
+            self._inverse, self.n_cycles = inverse_of(hierarchy, dtype)
+            response = self._inverse(np.ones(pattern.whole.n, dtype))
             if np.isfinite(response).all() and response.sum() > 0:
                 break
+        self._dtype = dtype
         self.place = np.arange(pattern.whole.n)
 
     def single_precision(self) -> MultigridFactor:
         return self
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
-        count(back_solves=len(x), multiply_adds=len(x) * self._cycle.multiply_adds)
+        count(back_solves=len(x), multiply_adds=len(x) * self._inverse.multiply_adds)
         for row in x:
-            row[:] = self._cycle(row.astype(self._cycle.dtype))
+            row[:] = self._inverse(row.astype(self._dtype))
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         if rhs.ndim == 2:
@@ -118,20 +152,20 @@ class MultigridFactor:
             multiply(whole.indptr, whole.indices, self._values, x.ravel(), y)
             return y
 
-        def one_cycle(residual: NDArray[np.float64]) -> NDArray[Any]:
-            # A cycle, a product with the matrix, and six with vectors.
+        def cycles(residual: NDArray[np.float64]) -> NDArray[Any]:
+            # The cycles, a product with the matrix, and six with vectors.
             count(
                 back_solves=1,
-                multiply_adds=self._cycle.multiply_adds + 2 * len(self._values) + 5 * n,
+                multiply_adds=self._inverse.multiply_adds + 2 * len(self._values) + 5 * n,
             )
-            return np.asarray(self._cycle(residual.ravel().astype(self._cycle.dtype)))
+            return np.asarray(self._inverse(residual.ravel().astype(self._dtype)))
 
-        matrix, cycle = (
-            sp_linalg.LinearOperator((n, n), apply, dtype=np.float64)
-            for apply in (product, one_cycle)
+        matrix, inverse = (
+            sp_linalg.LinearOperator((n, n), apply, dtype=np.float64) for apply in (product, cycles)
         )
+        iterations = -(-MAX_CYCLES // self.n_cycles)
         solution, failed = sp_linalg.cg(
-            matrix, rhs / scale, rtol=CYCLE_TOLERANCE, maxiter=MAX_CYCLES, M=cycle
+            matrix, rhs / scale, rtol=CYCLE_TOLERANCE, maxiter=iterations, M=inverse
         )
         missed = 0.0
         if failed:

@@ -45,6 +45,34 @@ def probe_cost(source: str) -> str:
     )
 
 
+def poisson_ratios(source: str) -> str:
+    """Show the work of multigrid by Poisson's ratio and size, relative to the least ratio."""
+    rows = content_of(source)["rows"]
+    sizes = list(dict.fromkeys(row["unknowns"] for row in rows))
+    of = {(row["unknowns"], row["poisson"]): row for row in rows}
+    ratios = list(dict.fromkeys(row["poisson"] for row in rows))
+    headings = ("cycles", "iterations: median, most", "multiply-adds")
+    return markdown(
+        ["ν", *(f"{size:,} unknowns: {heading}" for size in sizes for heading in headings)],
+        [
+            [
+                f"{ratio:g}",
+                *(
+                    cell
+                    for size in sizes
+                    for row in [of[size, ratio]]
+                    for cell in (
+                        f"{row['cycles']}",
+                        f"{row['iterations']:.0f}, {row['most_iterations']}",
+                        number(row["multiply_adds"] / of[size, ratios[0]]["multiply_adds"]),
+                    )
+                ),
+            ]
+            for ratio in ratios
+        ],
+    )
+
+
 def scaling(source: str) -> str:
     """Show the cost of a solve against the number of unknowns."""
     headings = ["unknowns", "rest state", "set-up, s", "solve, ms", "on two threads, ms"]

@@ -18,6 +18,7 @@ from tests.published.cost_tables import (
     generation,
     large_deformation,
     law_speed,
+    poisson_ratios,
     probe_cost,
     scaling,
 )
@@ -358,6 +359,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "reduced-peers": reduced_peers,
     "large-deformation": large_deformation,
     "law-speed": law_speed,
+    "poisson-ratios": poisson_ratios,
     "probe-cost": probe_cost,
     "scaling": scaling,
     "generation": generation,

@@ -18,7 +18,8 @@ from mor_bench.errors import (
 from mor_bench.hard_cases.setups import LAW, dense, distorted_box, free_assembler
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.banded import BandedCholesky
-from mor_bench.mechanics.cycles import Cycle, level_of
+from mor_bench.mechanics.chebyshev import Chebyshev, cycles_for, lowest_eigenvalue
+from mor_bench.mechanics.cycles import RELAXATION, Cycle, Exact, Inverse, level_of
 from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.mechanics.linear import (
     NotPositiveDefiniteError,
@@ -279,32 +280,82 @@ def test_a_multigrid_cycle_is_symmetric_and_as_good_on_finer_meshes(
     assert iterations[1] <= 4 / 3 * iterations[0]
 
 
-def test_a_multigrid_cycle_equals_its_definition_with_dense_matrices() -> None:
-    """Sweeps by L + D and D + Lᵀ in blocks of 3, and two cycles of the next level."""
+def test_nearly_incompressible_bodies_take_few_iterations_on_every_mesh(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Single cycles take more than 40 iterations or fail."""
+    monkeypatch.setattr("mor_bench.mechanics.model.MAX_BAND_ENTRIES", 0)
+    spec = mor_bench.load_scene("beam-nearly-incompressible").spec.model_dump(mode="json")
+    spec["material"]["poisson"], iterations = 0.49, []
+    for across in (7, 12):
+        spec["geometry"] = {"shape": "box", "size_m": [1.0, 1.0, 1.0], "cells": [across] * 3}
+        model = FullOrderModel(mor_bench.load_scene(spec))
+        assert isinstance(model.rest_factor, MultigridFactor)
+        iterations.append(model.solve(tip_load(model.scene, 1.0)).iterations)
+    assert max(iterations) <= 15, iterations
+
+
+def cycle_of_dense_matrices(depth: int) -> tuple[Cycle, list[Array], list[Array]]:
+    """Return a cycle on beam-tiny, in double precision, and its matrices and prolongations."""
     model, rng = FullOrderModel(mor_bench.load_scene("beam-tiny")), np.random.default_rng(0)
     matrices = [dense(model.assembler, model.rest_tangent)]
-    transfers = [rng.normal(size=shape) for shape in ((len(matrices[0]), 60), (60, 18))]
+    transfers = [rng.normal(size=shape) for shape in ((len(matrices[0]), 60), (60, 18))[:depth]]
     for P in transfers:
         matrices.append(P.T @ matrices[-1] @ P)
+    inverse: Inverse = Exact(np.linalg.inv(matrices[-1]))
+    for A, P in reversed(list(zip(matrices, transfers, strict=False))):
+        inverse = Cycle(level_of(A, P, np.float64), inverse)
+    assert isinstance(inverse, Cycle)
+    return inverse, matrices, transfers
+
+
+def test_a_multigrid_cycle_equals_its_definition_with_dense_matrices() -> None:
+    """Damped sweeps in blocks of 3 around the correction of the next level."""
+    cycle, matrices, transfers = cycle_of_dense_matrices(2)
 
     def defined(depth: int, b: Array) -> Array:
         if depth == 2:
             return np.asarray(np.linalg.solve(matrices[2], b), dtype=np.float64)
         A, P = matrices[depth], transfers[depth]
         node = np.arange(len(b)) // 3
-        forward = np.where(node[:, None] >= node, A, 0.0)
+        lower = np.where(node[:, None] > node, A, 0.0)
+        forward = lower + np.where(node[:, None] == node, A, 0.0) / RELAXATION
         x = np.linalg.solve(forward, b)
-        coarse = P.T @ (b - A @ x)
-        found = defined(depth + 1, coarse)
-        if depth == 0:
-            found = found + defined(1, coarse - matrices[1] @ found)
-        x = x + P @ found
+        x = x + P @ defined(depth + 1, P.T @ (b - A @ x))
         return np.asarray(x + np.linalg.solve(forward.T, b - A @ x))
 
-    levels = [level_of(A, P, np.float64) for A, P in zip(matrices, transfers, strict=False)]
-    cycle, b = Cycle(levels, np.linalg.inv(matrices[2])), rng.normal(size=len(matrices[0]))
+    b = np.random.default_rng(1).normal(size=len(matrices[0]))
     wanted = defined(0, b)
-    np.testing.assert_allclose(cycle(b), wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+    found, product = cycle.with_product(b)
+    for x in (found, cycle(b)):
+        np.testing.assert_allclose(x, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+    np.testing.assert_allclose(
+        product, matrices[0] @ wanted, rtol=0, atol=1e-9 * np.abs(matrices[0] @ wanted).max()
+    )
+
+
+def eigenvalues_of(inverse: Inverse, matrix: Array) -> Array:
+    """Return the eigenvalues of an approximate inverse times a matrix, in ascending order."""
+    product = np.stack([inverse(column) for column in matrix.T], axis=1)
+    values = np.linalg.eigvals(product)
+    assert np.abs(values.imag).max() <= 1e-9
+    return np.sort(values.real)
+
+
+def test_chebyshev_cycles_reduce_all_errors_as_their_polynomial() -> None:
+    """The bound is 1 / T_k((1 + a) / (1 - a)) for eigenvalues from a to 1, attained at a."""
+    cycle, (matrix, *_), _ = cycle_of_dense_matrices(1)
+    of_cycle = eigenvalues_of(cycle, matrix)
+    lowest = of_cycle[0]
+    assert 0 < lowest <= lowest_eigenvalue(cycle) <= 1.2 * lowest
+    assert of_cycle[-1] <= 1 + 1e-9
+    for k in (2, 3, 5):
+        left = 1 / np.cosh(k * np.arccosh((1 + lowest) / (1 - lowest)))
+        found = (1 + left) * eigenvalues_of(Chebyshev(cycle, lowest, k), matrix)
+        assert found[0] == pytest.approx(1 - left, rel=1e-6)
+        assert found[-1] <= (1 + left) * (1 + 1e-9)
+        assert cycles_for(lowest, 1.01 * left) == k
+        assert cycles_for(lowest, 0.99 * left) == k + 1
 
 
 @pytest.mark.parametrize("scaled", [False, True])
@@ -322,4 +373,5 @@ def test_equal_rows_of_a_multigrid_level_are_stored_once(scaled: bool) -> None:
         row = np.stack([K[3 * i : 3 * i + 3, j : j + 3] for j in [*own, 3 * i]])
         stored = blocks[begin : begin + len(row)]
         np.testing.assert_allclose(stored, row, rtol=0, atol=4e-5 * np.abs(row).max())
-        np.testing.assert_allclose(blocks[begin + len(row)] @ stored[-1], np.eye(3), atol=1e-8)
+        inverse = blocks[begin + len(row)] / RELAXATION
+        np.testing.assert_allclose(inverse @ stored[-1], np.eye(3), atol=1e-8)
