@@ -165,7 +165,8 @@ def latency(contestant: Contestant) -> dict[str, Any]:
     method, forces = contestant.method, contestant.data.test.forces[:8]
     network = network_of(method)
     if isinstance(network, FieldNetwork):
-        given = list(network.encode(torch.from_numpy(forces.astype(np.float32))).split(1))
+        features = network.encode(torch.from_numpy(forces.astype(np.float32)))
+        given = [features[i : i + 1] for i in range(len(features))]
     else:
         given = [torch.randn(1, *method.grid_.shape, 3).permute(0, 4, 1, 2, 3) for _ in forces]
     on_device = volumes_last(deepcopy(network).to("cuda"))

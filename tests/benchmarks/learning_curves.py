@@ -11,7 +11,7 @@ so that the same command continues after an interruption.
 from __future__ import annotations
 
 import json
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
 from multiprocessing import get_context
@@ -173,7 +173,7 @@ def main(
     ):
         curves = Curves(dataset, report, trainings, most_core_s)
         curves.read()
-        running = []
+        running: list[Future[Any]] = []
         for name in method:
             usual = int(load_method_spec(name).parameters["iterations"])
             running.append(waiting.submit(curves.iterate, name, whole, usual))
