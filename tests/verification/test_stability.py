@@ -23,6 +23,7 @@ from mor_bench.mechanics.stability import (
 from mor_bench.scene.materials import NeoHookean
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene
+from tests.benchmarks.probe_cost import NoSearch
 
 from .scenes import relative_residual
 
@@ -135,14 +136,6 @@ def test_an_unstable_equilibrium_is_never_returned_by_the_accelerated_pass() -> 
         assert relative_residual(model, load, solution.displacement) <= 1e-8
 
 
-class NoProbes:
-    """Stability probes that accept every state."""
-
-    begun = complete = convex = True
-
-    def __init__(self, problem: object) -> None: ...
-
-
 def beams(thickness: float, beside: float) -> tuple[FullOrderModel, Array]:
     """Return a beam of 2 m with another beside it, and a load that compresses the first by 1 N.
 
@@ -165,7 +158,7 @@ def beams(thickness: float, beside: float) -> tuple[FullOrderModel, Array]:
 def test_buckling_is_noticed_under_a_symmetric_load_also_beside_a_softer_body(
     thickness: float, beside: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing pushes a straight column to the side: only the probes see that it is unstable."""
+    """Nothing pushes a straight column to the side: only the search sees that it is unstable."""
     model, push = beams(thickness, beside)
     euler = np.pi**2 * 500.0 * 0.5 * thickness**3 / 12 / 4 / 2.0**2
 
@@ -178,7 +171,7 @@ def test_buckling_is_noticed_under_a_symmetric_load_also_beside_a_softer_body(
     q = None
     for factor in (0.5, 0.9, 1.1, 1.3):
         with monkeypatch.context() as patch:
-            patch.setattr(accelerated, "Probes", NoProbes)
+            patch.setattr(accelerated, "search_of", NoSearch)
             q = straight(factor, q).q
         stable = lowest_tangent_eigenvalue(model, q) > 0
         assert stable == (factor < 1.2)
