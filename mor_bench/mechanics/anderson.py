@@ -99,32 +99,35 @@ def _combine(correction, steps, changes, held, newest, gram, out):
 
 
 class Anderson:
-    """Memory of the acceleration: the last differences of iterates, corrections and residuals."""
+    """Memory of the acceleration: the last differences of iterates and of corrections."""
 
     def __init__(self, n: int) -> None:
         self._steps, self._changes = np.empty((2, WINDOW, n))
         self._gram = np.zeros((WINDOW, WINDOW))
         self._held = 0
         self._count = 0
-        self._last: tuple[Array, Array, Array] | None = None
-        self._curvatures = np.ones(WINDOW)
+        self._last: tuple[Array, Array] | None = None
 
-    @property
-    def convex(self) -> bool:
-        """True if the force rose along every kept step: no negative curvature was seen."""
-        return bool((self._curvatures > 0).all())
+    def leap(self, keep: bool) -> None:
+        """Take no difference to the next state, from which a disturbance separates the last one.
 
-    def advance(self, q: Array, correction: Array, residual: Array) -> Array:
-        """Return the step from q, given the correction P⁻¹r and the residual r there."""
+        With it, the next step would undo the disturbance, whatever its modes are. The earlier
+        differences are forgotten as well, unless ``keep`` is true.
+        """
+        self._last = None
+        if not keep:
+            self._count = self._held = 0
+
+    def advance(self, q: Array, correction: Array) -> Array:
+        """Return the step from q, given the correction P⁻¹r of the residual r there."""
         slot = self._count % WINDOW
         if self._last is not None:
-            q_before, correction_before, residual_before = self._last
+            q_before, correction_before = self._last
             np.subtract(q, q_before, out=self._steps[slot])
             np.subtract(correction, correction_before, out=self._changes[slot])
-            self._curvatures[slot] = float(self._steps[slot] @ (residual_before - residual))
             self._count += 1
             self._held = min(self._count, WINDOW)
-        self._last = q, correction, residual
+        self._last = q, correction
         held = self._held
         count(multiply_adds=len(q) * (4 * held + (held > 0)))
         step = np.empty_like(q)

@@ -336,7 +336,10 @@ class PressedModel(FullOrderModel):
         spent = dict.fromkeys(left, 0)
         if inverse is not None:
             passes = (
-                accelerated(parts[i], inverse, loads[i], starts[i], options.tolerance) for i in left
+                accelerated(
+                    parts[i], inverse, loads[i], starts[i], options.tolerance, symmetric=False
+                )
+                for i in left
             )
             for number, attempt in run_in_step(inverse, passes):
                 i = left[number]

@@ -153,7 +153,7 @@ class Hybrid(Surrogate):
         for _ in range(self.steps or 1):
             residual = load - self.model_.force(u).force
             correction = inverse.solve_many([residual], [inverse.turned(u)])[0]
-            u = u + memory.advance(u, correction, residual)
+            u = u + memory.advance(u, correction)
         near = float(np.linalg.norm(u - guess)) <= NEAR * float(np.linalg.norm(u))
         if near and _least_det_f(inverse.at_nodes(u), *inverse.cells[:2]) >= SURE:
             return u

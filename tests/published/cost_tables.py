@@ -29,14 +29,15 @@ def law_speed(source: str) -> str:
 
 
 def probe_cost(source: str) -> str:
-    """Show the share of the stability probes in the counted work of a solve, in %."""
+    """Show the share of the search for negative curvature in the counted work of a solve."""
     units = {"residuals": "element_evaluations", "back-solves": "back_solves"}
     units["multiply-adds"] = "multiply_adds"
     return markdown(
-        ["end moves, m", "iterations", *units],
+        ["end moves, m", "iterations without it", "with it", *units],
         [
             [
                 f"{row['amplitude_m']:g}",
+                f"{row['iterations_without']}",
                 f"{row['iterations']}",
                 *(f"{100 * row['shares'][unit]:.1f} %" for unit in units.values()),
             ]

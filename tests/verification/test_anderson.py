@@ -31,7 +31,7 @@ def test_every_step_solves_the_least_squares_problem(n: int) -> None:
     for _ in range(2 * WINDOW + 2):
         q = iterates[-1]
         corrections.append(load - rates * q - 0.01 * np.sin(q))
-        step = memory.advance(q, corrections[-1], corrections[-1])
+        step = memory.advance(q, corrections[-1])
         expected = by_definition(iterates, corrections)
         np.testing.assert_allclose(step, expected, atol=1e-7 * np.abs(expected).max())
         iterates.append(q + step)
@@ -44,7 +44,7 @@ def test_a_linear_problem_with_few_rates_is_solved_at_once() -> None:
     memory, q = Anderson(len(rates)), np.zeros(len(rates))
     for _ in range(5):
         correction = load - rates * q
-        q = q + memory.advance(q, correction, correction)
+        q = q + memory.advance(q, correction)
     np.testing.assert_allclose(rates * q, load, atol=1e-10)
 
 
@@ -53,7 +53,7 @@ def test_changes_without_length_or_direction_of_their_own_are_left_out() -> None
     memory, q = Anderson(10), np.zeros(10)
     for _ in range(WINDOW + 3):  # one rate: all changes are parallel, then zero
         correction = load - 0.5 * q
-        step = memory.advance(q, correction, correction)
+        step = memory.advance(q, correction)
         assert np.isfinite(step).all()
         q = q + step
     np.testing.assert_allclose(0.5 * q, load, atol=1e-12)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,10 +12,11 @@ from numpy.typing import NDArray
 import mor_bench
 from mor_bench.errors import LimitPointError, SolverError
 from mor_bench.hard_cases.setups import LAW, LIMIT_PA, Arch, confined_column, dense, make_arch
-from mor_bench.mechanics import accelerated
+from mor_bench.mechanics import accelerated, curvature
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.mechanics.newton import Solution, solve_equilibrium
+from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibrium
 from mor_bench.mechanics.observed import ObservedModel
+from mor_bench.mechanics.pressed import full_order_model
 from mor_bench.mechanics.problem import Attempt
 from mor_bench.mechanics.stability import (
     LimitPoint,
@@ -23,6 +27,8 @@ from mor_bench.mechanics.stability import (
 from mor_bench.scene.materials import NeoHookean
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.sampling import draw_loads
+from tests.benchmarks.probe_cost import NoSearch
 
 from .scenes import relative_residual
 
@@ -135,14 +141,6 @@ def test_an_unstable_equilibrium_is_never_returned_by_the_accelerated_pass() -> 
         assert relative_residual(model, load, solution.displacement) <= 1e-8
 
 
-class NoProbes:
-    """Stability probes that accept every state."""
-
-    begun = complete = convex = True
-
-    def __init__(self, problem: object) -> None: ...
-
-
 def beams(thickness: float, beside: float) -> tuple[FullOrderModel, Array]:
     """Return a beam of 2 m with another beside it, and a load that compresses the first by 1 N.
 
@@ -165,7 +163,7 @@ def beams(thickness: float, beside: float) -> tuple[FullOrderModel, Array]:
 def test_buckling_is_noticed_under_a_symmetric_load_also_beside_a_softer_body(
     thickness: float, beside: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing pushes a straight column to the side: only the probes see that it is unstable."""
+    """Nothing pushes a straight column to the side: only the search sees that it is unstable."""
     model, push = beams(thickness, beside)
     euler = np.pi**2 * 500.0 * 0.5 * thickness**3 / 12 / 4 / 2.0**2
 
@@ -178,14 +176,14 @@ def test_buckling_is_noticed_under_a_symmetric_load_also_beside_a_softer_body(
     q = None
     for factor in (0.5, 0.9, 1.1, 1.3):
         with monkeypatch.context() as patch:
-            patch.setattr(accelerated, "Probes", NoProbes)
+            patch.setattr(accelerated, "search_of", NoSearch)
             q = straight(factor, q).q
         stable = lowest_tangent_eigenvalue(model, q) > 0
         assert stable == (factor < 1.2)
         assert straight(factor, q).converged == stable
 
 
-BAR = {
+BAR: dict[str, Any] = {
     "geometry": {"shape": "box", "size_m": [4.0, 1.0, 1.0], "cells": [16, 4, 4]},
     "material": {"law": "neo-hookean", "young_pa": 500.0, "poisson": 0.4},
 }
@@ -193,34 +191,94 @@ EULER_PA = 4.0 * np.pi**2 * 500.0 / 12.0 / 4.0**2
 """Buckling pressure of the bar as a slender beam that is guided at both ends; it is stocky."""
 
 
+@pytest.mark.filterwarnings("ignore::mor_bench.errors.LockingWarning")
+@pytest.mark.parametrize(("poisson", "tolerance"), [(0.4, 1e-8), (0.4, 1e-6), (0.48, 1e-8)])
 @pytest.mark.parametrize("factor", [0.3, 0.5, 0.8, 1.0])
-def test_a_column_that_is_guided_at_both_ends_is_solved_for_a_stable_state(factor: float) -> None:
+def test_a_column_that_is_guided_at_both_ends_is_solved_for_a_stable_state(
+    factor: float, poisson: float, tolerance: float
+) -> None:
     """Its buckling mode is not among the softest modes at rest, so few probes do not see it."""
     guide = {"region": "x-max", "components": ["y", "z"]}
-    scene = mor_bench.load_scene({**BAR, "supports": [{"region": "x-min"}, guide]})
+    bar = {**BAR, "material": {**BAR["material"], "poisson": poisson}}
+    scene = mor_bench.load_scene({**bar, "supports": [{"region": "x-min"}, guide]})
     model, points, cells = FullOrderModel(scene), scene.mesh.points, scene.mesh.cells
     end = points[:, 0] == points[:, 0].max()
     corners = end[cells] & (end[cells].sum(axis=1) == 4)[:, None]
     load = np.zeros_like(points)
     load[:, 0] = -np.bincount(cells[corners], minlength=len(points)) / corners.sum()
     push = factor * EULER_PA * load.ravel()[scene.free_dofs]
-    q = model.solve(push).displacement
+    q = model.solve(push, options=NewtonOptions(tolerance)).displacement
     assert lowest_tangent_eigenvalue(model, q) > 0
     aside = scene.at_all_dofs(q[None])[0].reshape(-1, 3)[:, 1:]
     assert (np.abs(aside).max() > 0.5) == (factor > 0.6)
 
 
+@pytest.mark.parametrize("tolerance", [1e-8, 1e-6])
 @pytest.mark.parametrize("motion", [(-0.5, 0.1, 0.0), (-0.9, 0.0, 0.0), (-1.0, 0.0, 0.01)])
 def test_a_column_under_a_moved_tool_is_solved_for_a_stable_state(
-    motion: tuple[float, float, float],
+    motion: tuple[float, float, float], tolerance: float
 ) -> None:
     tool = {"kind": "displacement", "region": "x-max", "magnitude_m": [0.0, 1.0], "samples": 1}
     scene = mor_bench.load_scene({**BAR, "supports": [{"region": "x-min"}], "loads": tool})
     moved = np.tile(motion, (scene.mesh.n_nodes, 1)).ravel()[scene.free_dofs]
-    (found,) = ObservedModel(scene).solve_many(moved[None])
+    (found,) = ObservedModel(scene).solve_many(moved[None], NewtonOptions(tolerance))
     assert isinstance(found, Solution)
     assert scene.observed_nodes is not None
     model = FullOrderModel(scene)
     tangent = dense(model.assembler, model.linearise(found.displacement)[1])
     hidden = ~np.isin(scene.free_dofs // 3, scene.observed_nodes)
     assert np.linalg.eigvalsh(tangent[np.ix_(hidden, hidden)])[0] > 0
+
+
+class Identity:
+    """An approximate inverse of stiffness one, and its response to a random force."""
+
+    def __init__(self, n: int, seed: int) -> None:
+        self._force = np.random.default_rng(seed).normal(size=n)
+
+    def turned(self, q: Array | None) -> Array:
+        return np.zeros(0)
+
+    def soft(self, rotations: Array) -> tuple[Array, Array]:
+        return self._force, self._force
+
+    def solve_many(self, residuals: Any, rotations: Any) -> Array:
+        return np.array(residuals)
+
+
+def test_a_disturbance_is_not_removed_along_earlier_steps_of_negative_curvature() -> None:
+    """The load moves a mode of negative curvature; Anderson's memory could remove it unseen."""
+    n = 300
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        stiffness = np.linspace(0.8, 1.2, n)
+        problem: Any = SimpleNamespace(n_unknowns=n, extent=1.0)
+        problem.force = lambda q, k=stiffness: SimpleNamespace(force=k * q, min_det_f=1.0)
+        load, inverse = 0.1 * rng.normal(size=n), Identity(n, 1000 + seed)
+        load[0] *= 10.0
+        for lowest in (0.8, -0.3):
+            stiffness[0] = lowest
+            one: Any = accelerated.accelerated(problem, inverse, load, None, 1e-8)  # type: ignore[arg-type]
+            ((_, found),) = accelerated.run_in_step(inverse, iter([one]))  # type: ignore[arg-type]
+            assert found.iterations < accelerated.ACCELERATED_ITERATIONS
+            assert found.converged == (lowest > 0)
+
+
+def test_the_disturbance_serves_fine_tolerances_and_symmetric_tangents(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Pressures that follow the surface have no symmetric tangent: the probes serve them."""
+    kinds: list[type] = []
+
+    def recorded(*request: Any) -> curvature.Search:
+        kinds.append(type(curvature.search_of(*request)))
+        return curvature.search_of(*request)
+
+    monkeypatch.setattr(accelerated, "search_of", recorded)
+    pressure = {"kind": "pressure", "regions": ["z-max"], "magnitude_pa": [1.0, 4.0], "samples": 1}
+    for tolerance, follower in ((1e-8, False), (1e-4, False), (1e-8, True)):
+        loads = {**pressure, "follower": follower}
+        scene = mor_bench.load_scene({**BAR, "supports": [{"region": "x-min"}], "loads": loads})
+        load = draw_loads(scene, 0, 1).nodal_forces(scene.patch_weights).ravel()[scene.free_dofs]
+        full_order_model(scene).solve(load, options=NewtonOptions(tolerance))
+    assert kinds == [curvature.Disturbance, curvature.Probes, curvature.Probes]
