@@ -105,7 +105,7 @@ def test_contradictions_are_refused(changed: dict[str, Any], message: str) -> No
 
 def test_an_instrument_must_not_penetrate_the_body_at_rest_under_gravity() -> None:
     up = {"density_kg_m3": 10.0, "acceleration_m_s2": [0.0, 0.0, 9.81]}
-    with pytest.raises(SpecError, match="must not penetrate the body at rest under gravity"):
+    with pytest.raises(SpecError, match="must not penetrate the body at rest under its pre-load"):
         ContactModel(block(gravity=up))
 
 
@@ -208,7 +208,7 @@ def test_a_check_finds_an_instrument_in_the_rest_state(tmp_path: Path) -> None:
     path = tmp_path / "heavy.toml"
     up = "acceleration_m_s2 = [0.0, 0.0, 9.81]"
     path.write_text(f"{FILE}[gravity]\ndensity_kg_m3 = 10.0\n{up}\n", encoding="utf-8")
-    with pytest.raises(SpecError, match="at rest under gravity"):
+    with pytest.raises(SpecError, match="at rest under its pre-load"):
         check_file(path)
 
 

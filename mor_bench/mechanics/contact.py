@@ -141,7 +141,7 @@ class ContactModel(FullOrderModel):
     UnconstrainedBodyError, MissingDependencyError
         As `FullOrderModel`.
     SpecError
-        If the instrument penetrates the body at rest under gravity.
+        If the instrument penetrates the body at rest under its pre-load.
     """
 
     def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:

@@ -84,7 +84,7 @@ class ContactPoints:
     UnsupportedSceneError
         If no instrument presses the scene.
     SpecError
-        If the instrument penetrates the body at rest under gravity.
+        If the instrument penetrates the body at rest under its pre-load.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -97,7 +97,7 @@ class ContactPoints:
             if deepest > ROUND_OFF * float(np.ptp(self._points, axis=0).max()):
                 raise SpecError(
                     f"{scene.name}: `loads.instrument` must not penetrate the body at rest under "
-                    f"gravity; it does, by {deepest:.6g} m."
+                    f"its pre-load; it does, by {deepest:.6g} m."
                 )
 
     def first_step(self, motion: Array) -> float:

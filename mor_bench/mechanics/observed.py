@@ -97,7 +97,7 @@ class _HiddenModel(FullOrderModel):
 
     def __init__(self, whole: FullOrderModel, scene: Scene, solver: SolverName | None) -> None:
         super().__init__(scene, solver)
-        self._whole = whole
+        self._whole, self.linear_at_rest = whole, whole.linear_at_rest
         self.hidden = np.searchsorted(whole.scene.free_dofs, scene.free_dofs)
         inside = np.zeros(whole.n_unknowns, dtype=bool)
         inside[self.hidden] = True
@@ -174,8 +174,11 @@ class ObservedModel:
         whole = FullOrderModel(scene, solver)
         held = replace(
             scene,
-            # The whole model has the rest state under gravity, and moves the tool.
-            spec=scene.generated.model_copy(update={"gravity": None, "loads": None}),
+            # The whole model has the rest state, and moves the tool.
+            spec=scene.generated.model_copy(
+                update={"gravity": None, "constant_pressures": (), "loads": None}
+            ),
+            constant_pressures=(),
             fixed_nodes=np.union1d(scene.fixed_nodes, scene.observed_nodes),
         )
         with warnings.catch_warnings():

@@ -1,7 +1,7 @@
 """Equilibria of a parametric scene: each load acts on a body with its own parameters.
 
 The laws of Young's modulus and Poisson's ratio are linear in Young's modulus Y. So without springs
-and gravity, the displacement under a load f with Y is that under f Y₀ / Y with Y₀, exactly. Bodies
+and pre-load, the displacement under a load f with Y is that under f Y₀ / Y with Y₀, exactly. Bodies
 that differ in nothing else share one model. Every other body has a model of its own, with the
 sparsity pattern of the reference. The reference's factor preconditions its iterations. This takes
 less counted work than a factor for each body, except on small meshes at tight tolerances, and where
@@ -46,7 +46,7 @@ class Bodies:
     def __init__(self, scene: Scene) -> None:
         self.scene, self.reference = scene, reference_parameters(scene)
         spec, names = scene.generated, scene.parameter_names
-        scales = "young_pa" in names and not spec.springs and spec.gravity is None
+        scales = "young_pa" in names and not spec.springs and not spec.is_preloaded
         self._young = names.index("young_pa") if scales else None
 
     def shared(self, parameters: Array) -> tuple[Array, float]:

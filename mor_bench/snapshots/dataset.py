@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError, check_count
 from mor_bench.mechanics.observed import ToolForces
-from mor_bench.scene.scene import Scene, as_spec, imported_scene, load_scene
+from mor_bench.scene.scene import Scene, imported_scene, load_scene
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import GenerationOptions, generate, read_shards
 from mor_bench.snapshots.given import Given, given_of
@@ -23,7 +23,7 @@ from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.sampling import n_samples_of, path_of_samples, repeated
 from mor_bench.snapshots.split import split_imported, split_samples
 from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set
-from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, SplitBy
+from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, SplitBy, as_spec
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:

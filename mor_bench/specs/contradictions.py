@@ -88,6 +88,7 @@ def _of_parameters(tables: Tables) -> Iterator[str]:
         "the loads are pressures": isinstance(loads, Pressure),
         "the loads act on points or lines": isinstance(loads, PointLoads | LineLoads),
         "`springs` are given": bool(tables.get("springs")),
+        "`constant_pressures` are given": bool(tables.get("constant_pressures")),
     }
     for where in (other for other, present in fixed_shape.items() if present):
         if parameters.scale is not None:
