@@ -330,35 +330,3 @@ def generating_model(scene: Scene) -> FullOrderModel | ObservedModel:
     if scene.contact:
         return _contact_model(scene, None)
     return ObservedModel(scene) if scene.motion else full_order_model(scene)
-
-
-class ToolForces:
-    """Forces of a moved tool, or an instrument, on its nodes: the internal forces there.
-
-    Their sum is minus the reaction that the tool feels. Foundations resist, and gravity acts, as
-    part of the internal forces. At an equilibrium they are the forces of the contact.
-
-    Parameters
-    ----------
-    scene : Scene
-        A scene with a moved tool, or an instrument that presses.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        moved = scene.motion or scene.contact
-        if moved is None or scene.observed_nodes is None:
-            raise UnsupportedSceneError(f"{scene.name}: no tool moves the body.")
-        self._model, self._nodes = FullOrderModel(scene), scene.observed_nodes
-
-    def __call__(self, displacements: Array) -> Array:
-        """Return the forces (n, n_nodes, 3), N, at displacements (n, n_free) of the free dofs, m.
-
-        They are zero at all other nodes, and NaN where the displacements are not finite.
-        """
-        scene = self._model.scene
-        forces = np.zeros((len(displacements), scene.mesh.n_nodes, 3))
-        for row, u in zip(forces, displacements, strict=True):
-            finite = bool(np.isfinite(u).all())
-            force = self._model.force(u).force if finite else np.full(len(u), np.nan)
-            row[self._nodes] = scene.at_all_dofs(force[None]).reshape(-1, 3)[self._nodes]
-        return forces

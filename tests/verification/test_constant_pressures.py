@@ -17,9 +17,9 @@ from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.contact import ContactModel
 from mor_bench.mechanics.discretisation import discretisation_of
 from mor_bench.mechanics.model import FullOrderModel, rest_displacement
+from mor_bench.mechanics.moved_bodies import ToolForces, generator_of
 from mor_bench.mechanics.newton import Solution
-from mor_bench.mechanics.observed import ObservedModel, ToolForces
-from mor_bench.mechanics.parametric import generator_of
+from mor_bench.mechanics.observed import ObservedModel
 from mor_bench.mechanics.pressed import PressedModel
 from mor_bench.mechanics.reactions import reaction_forces
 from mor_bench.scene.other_meshes import refined
