@@ -105,8 +105,8 @@ def unknown_equations(scene: Scene, *, observed: bool = False, contact: bool = F
     """
     if scene.material is None:
         return NO_EQUATIONS
-    if observed:
-        return None
+    if observed:  # known displacements tell nothing about pressures that vary
+        return FOLLOWS if scene.follows and scene.observed_nodes is not None else None
     if contact and scene.contact:
         if followers_of(scene.constant_pressures):
             return FOLLOWS
