@@ -225,13 +225,13 @@ class Surrogate:
         SolverError
             If a method that solves equations finds no valid equilibrium.
         """
-        if isinstance(forces, ObservedDisplacements):
+        if has_values(parameters) or self._fitted_scene().parameter_names:
+            both = checked_parametric(self._fitted_scene(), forces, parameters)
+            found, shape = self.answer_parametric(both.values, both.parameters), both.values.shape
+        elif isinstance(forces, ObservedDisplacements):
             given = self._checked(forces)
             assert isinstance(given, ObservedDisplacements)
             found, shape = self.answer_observed(given), given.values.shape
-        elif has_values(parameters) or self._fitted_scene().parameter_names:
-            both = checked_parametric(self._fitted_scene(), forces, parameters)
-            found, shape = self.answer_parametric(both.values, both.parameters), both.values.shape
         else:
             values = checked_forces(self._fitted_scene(), forces)
             found, shape = self.answer(values), values.shape

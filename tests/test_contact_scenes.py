@@ -15,10 +15,11 @@ from mor_bench.errors import InvalidInputError, SpecError, UnavailableBackendErr
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.measure.reaction_errors import ReactionErrors
 from mor_bench.mechanics.contact import ContactModel
-from mor_bench.mechanics.observed import ToolForces
+from mor_bench.mechanics.moved_bodies import ToolForces
 from mor_bench.report.scene_text import scene_text
 from mor_bench.report.suite_overview import dataset_family
 from mor_bench.runs.file_check import check_file
+from mor_bench.scene.scene import load_scene
 from mor_bench.scene.symmetry import mirrors
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.given import ObservedDisplacements
@@ -105,7 +106,7 @@ def test_contradictions_are_refused(changed: dict[str, Any], message: str) -> No
 
 def test_an_instrument_must_not_penetrate_the_body_at_rest_under_gravity() -> None:
     up = {"density_kg_m3": 10.0, "acceleration_m_s2": [0.0, 0.0, 9.81]}
-    with pytest.raises(SpecError, match="must not penetrate the body at rest under gravity"):
+    with pytest.raises(SpecError, match="must not penetrate the body at rest under its pre-load"):
         ContactModel(block(gravity=up))
 
 
@@ -129,6 +130,22 @@ def test_motions_fill_a_cone() -> None:
     straight = draw_loads(block(), 0, 5).vectors[:, 0]
     assert not straight[:, :2].any()
     assert (straight[:, 2] < 0).all()
+
+
+def test_an_instrument_moves_against_the_nearest_part_of_the_surface_by_default() -> None:
+    table = content(loads=LOADS)
+    del table["loads"]["direction"]
+    scene, expected = load_scene(table), block(loads=LOADS)
+    np.testing.assert_array_equal(
+        draw_loads(scene, 0, 9).vectors, draw_loads(expected, 0, 9).vectors
+    )
+    assert "direction" not in scene.generated.physics()["loads"]
+    beside = {"sphere": {"radius_m": 0.3, "centre_m": [1.35, 0.4, 0.3]}}
+    loads = {"region": "surface", "instrument": beside, "magnitude_m": [0.06, 0.1]}
+    del (table := content(loads=loads))["loads"]["direction"]
+    drawn = draw_loads(load_scene(table), 0, 5).vectors[:, 0]
+    assert (drawn[:, 0] < 0).all()
+    assert np.abs(drawn[:, 1:]).max() < 1e-12
 
 
 def test_methods_get_the_motion_of_the_instrument(data: Dataset) -> None:
@@ -208,7 +225,7 @@ def test_a_check_finds_an_instrument_in_the_rest_state(tmp_path: Path) -> None:
     path = tmp_path / "heavy.toml"
     up = "acceleration_m_s2 = [0.0, 0.0, 9.81]"
     path.write_text(f"{FILE}[gravity]\ndensity_kg_m3 = 10.0\n{up}\n", encoding="utf-8")
-    with pytest.raises(SpecError, match="at rest under gravity"):
+    with pytest.raises(SpecError, match="at rest under its pre-load"):
         check_file(path)
 
 

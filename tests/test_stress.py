@@ -20,6 +20,7 @@ from mor_bench.hard_cases import mechanics_cases, reduction_cases, setups
 from mor_bench.hard_cases.case import LONGEST, Scenes, Subject
 from mor_bench.hard_cases.catalogue import CASES, CaseResult, attempt, cases_for
 from mor_bench.hard_cases.suite import StressResults, stress
+from mor_bench.mechanics import locking
 from mor_bench.mechanics import model as model_module
 from mor_bench.report.hard_case_table import print_stress, stress_table
 from mor_bench.scene import soundness
@@ -253,7 +254,7 @@ PLANTS = {
         "fem", "stiffness-contrast", mechanics_cases, "condition_number", lambda *_: 1.0
     ),
     "ill-conditioning gives no warning": Plant(
-        "fem", "stiffness-contrast", model_module, "ILL_CONDITIONED", np.inf
+        "fem", "stiffness-contrast", locking, "ILL_CONDITIONED", np.inf
     ),
     "supports are not checked": Plant(
         "fem", "unconstrained", model_module, "check_supports", lambda _: None

@@ -30,8 +30,10 @@ from mor_bench.mechanics.kernels import (
     relax,
 )
 from mor_bench.mechanics.laws import general_force, general_multiply_adds
-from mor_bench.mechanics.pattern import Pattern, build_pattern
+from mor_bench.mechanics.pattern import build_pattern
+from mor_bench.mechanics.pressed_facets import ConstantFollowers
 from mor_bench.mechanics.slabs import Slabs, slabs_of
+from mor_bench.mechanics.surface_springs import SurfaceSprings
 from mor_bench.mechanics.turned import TurnedDofs
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.supports import Frames
@@ -77,24 +79,6 @@ def _triples(
     copied = ~fixed & (np.diff(dof_of_node, axis=1) != 1).any(axis=1)
     starts[copied] = n + 3 + 3 * np.arange(copied.sum())
     return starts.astype(np.uint32), dof_of_node[copied].ravel()
-
-
-def _placed(
-    springs: sp.csr_array, dofs: NDArray[np.int64], pattern: Pattern
-) -> tuple[sp.csr_array, NDArray[np.int64], Array]:
-    """Return the springs over the rows of a pattern, and their upper entries' places and values.
-
-    The nodes of a spring share a cell, so that the pattern has all entries if it has all cells.
-    """
-    found = springs.tocoo()
-    rows, columns = dofs[found.row], dofs[found.col]
-    free = (rows < pattern.n) & (columns < pattern.n)
-    rows, columns, entries = rows[free], columns[free], found.data[free]
-    matrix = sp.csr_array((entries, (rows, columns)), shape=(pattern.n, pattern.n))
-    upper = rows <= columns
-    keys = pattern.rows * pattern.n + pattern.indices
-    slots = np.searchsorted(keys, rows[upper] * pattern.n + columns[upper])
-    return matrix, slots, entries[upper]
 
 
 class Assembler:
@@ -210,13 +194,18 @@ class Assembler:
         self._plain = (
             body.springs is None
             and body.rest is None
+            and not body.followers
             and self._frames is None
             and not len(self._copied)
         )
-        self._springs: tuple[sp.csr_array, NDArray[np.int64], Array] | None = None
+        self._springs: SurfaceSprings | None = None
+        own = self._dof_of_node
         if body.springs is not None:
-            own = self._dof_of_node.ravel()
-            self._springs = _placed(body.springs, own, self.summed_pattern)
+            self._springs = SurfaceSprings(body.springs, own.ravel(), self.summed_pattern)
+        self._followers: ConstantFollowers | None = None
+        if body.followers:
+            where = body.points, body.followers, own
+            self._followers = ConstantFollowers(*where, self.summed_pattern)
         self._rest: tuple[Array, Array] | None = None
         if body.rest is not None:
             frames = self._frames
@@ -306,19 +295,28 @@ class Assembler:
         return np.asarray(dofs[dofs != self._n_summed])
 
     def _sum_all(self, total: Array, force: Array, values: Array) -> tuple[float, float]:
-        """Add forces and tangents of cells and springs; return energy and min det F."""
+        """Add forces and tangents of cells, springs and followers; return energy and min det F."""
         energy, min_det_f = self._sum(total, self._dofs, force, values)
         self._collect(force)
-        if self._springs is None:
-            return energy, min_det_f
-        matrix, slots, entries = self._springs
         moved = total[: self._n_summed]
-        own = matrix @ moved
-        count(multiply_adds=matrix.nnz)
-        force[: self._n_summed] += own
-        if len(values):
-            values[slots] += entries
-        return energy + 0.5 * float(own @ moved), min_det_f
+        if self._springs is not None:
+            energy += self._springs.add(moved, force, values)
+        if self._followers is not None:
+            rest = np.zeros(len(moved)) if self._rest is None else self._rest[0][: len(moved)]
+            energy += self._followers.add(moved, rest, force, values)
+        return energy, min_det_f
+
+    @property
+    def force_at_rest(self) -> Array:
+        """The internal force (n_dofs,), N, of the rest state; zero without any."""
+        return np.zeros(self.n_dofs) if self._rest is None else self._rest[1]
+
+    def skew_tangent(self, u: Array) -> sp.csr_array | None:
+        """Return the skew part of the tangent, N/m, of followers; None without any."""
+        if self._followers is None:
+            return None
+        skew = self._followers.skew_stiffness(self._total(u)[: self._n_summed])
+        return skew if self.turned is None else self.turned.matrix(skew)
 
     def force(self, u: Array) -> State:
         """Return the state at displacements ``u`` (n_dofs,), m."""
@@ -373,7 +371,8 @@ class Assembler:
         padded, v, before = self._total(u), np.zeros(self.n_dofs), np.zeros(self.n_dofs)
         load = load if self._rest is None else load + self._rest[1]
         done, status, min_det = 0, RUNNING, np.inf
-        if self._has_own_kernel and self._springs is None and not len(self._copied):
+        none_else = self._springs is None and self._followers is None
+        if self._has_own_kernel and none_else and not len(self._copied):
             cells = self._dofs, self._gradients, self._w_lam, self._w_mu
             done, status, min_det = relax(padded, v, before, load, mass, control, n_steps, *cells)
             count(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from typing import Protocol, Self
 
 import numpy as np
@@ -16,11 +17,18 @@ from mor_bench.errors import (
     UnsupportedSceneError,
 )
 from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.contact_acceleration import (
+    PressedInverse,
+    TouchedDofs,
+    accelerated_contact,
+)
 from mor_bench.mechanics.contact_points import ContactPoints, NodalContact, Touch, motion_of
+from mor_bench.mechanics.linear import NotPositiveDefiniteError
 from mor_bench.mechanics.load_steps import LoadSteps
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import CERTIFY_TOLERANCE, FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, Solution, descent, is_certified
 from mor_bench.mechanics.problem import Attempt, Problem, is_round_off
+from mor_bench.mechanics.rotated import conjugate_gradients
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import SolverName
 
@@ -52,14 +60,19 @@ class PressedProblem(Problem, Protocol):
         """Return the norm of the contact's force on the unknowns."""
         ...
 
+    def quickly(self, start: Array, tolerance: float) -> Attempt:
+        """Solve by an accelerated iteration; without one, the attempt has not converged."""
+        ...
+
 
 def solve_contact(
     model: PressedProblem, motion: Array, first_step: float, options: NewtonOptions
 ) -> Solution | SolverError:
     """Find the equilibrium of a body that an instrument presses; return an error if there is none.
 
-    The instrument moves along a straight line. Each step descends on the potential of body and
-    contact with a line search, so that contact may open and close. Steps that fail are halved.
+    The instrument moves along a straight line. Each step begins with the model's accelerated
+    iteration, if it has one. If that fails, a descent on the potential of body and contact with a
+    line search follows, so that contact may open and close. Steps that fail are halved.
 
     Parameters
     ----------
@@ -74,8 +87,15 @@ def solve_contact(
     q, steps, spent = np.zeros(model.n_unknowns), LoadSteps(first_step), 0
     while True:
         placed = model.under(steps.target * motion)
-        found = _settled(placed, q, options.tolerance)
-        spent += found.iterations
+        half = model.under(0.5 * (steps.reached + steps.target) * motion)
+        for places in ([placed], [half, placed]):
+            found = _quickly(places, q, options.tolerance)
+            spent += found.iterations
+            if found.valid:
+                break
+        else:
+            found = _settled(placed, q, options.tolerance)
+            spent += found.iterations
         if found.valid:
             q = found.q
             steps.accept()
@@ -89,6 +109,16 @@ def solve_contact(
             if found.min_det_f <= 0:
                 return InvertedElementError(f"elements invert: {story}.", cuts=steps.cuts)
             return NoEquilibriumError(f"no stable equilibrium found: {story}.", cuts=steps.cuts)
+
+
+def _quickly(places: Sequence[PressedProblem], q: Array, tolerance: float) -> Attempt:
+    """Return the last of accelerated iterations with the instrument at several places in turn."""
+    found = Attempt(q, 1.0, 0, converged=True)
+    for placed in places:
+        if found.valid:
+            after = placed.quickly(found.q, tolerance)
+            found = replace(after, iterations=found.iterations + after.iterations)
+    return found
 
 
 def _settled(model: PressedProblem, start: Array, tolerance: float) -> Attempt:
@@ -132,7 +162,7 @@ class ContactModel(FullOrderModel):
     scene : Scene
         A scene with an instrument.
     solver : str, optional
-        As for `FullOrderModel`. Its accelerated iteration is not used.
+        As for `FullOrderModel`.
 
     Raises
     ------
@@ -141,7 +171,7 @@ class ContactModel(FullOrderModel):
     UnconstrainedBodyError, MissingDependencyError
         As `FullOrderModel`.
     SpecError
-        If the instrument penetrates the body at rest under gravity.
+        If the instrument penetrates the body at rest under its pre-load.
     """
 
     def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
@@ -153,11 +183,14 @@ class ContactModel(FullOrderModel):
         points, pattern = ContactPoints(scene), self.assembler.pattern
         self._contact = NodalContact(points, number.reshape(-1, 3), pattern)
         self.motion = np.zeros(3)
+        self._touched: TouchedDofs | None = None
 
     def prepare(self) -> None:
         _ = self.rest_tangent
         if self.iterative:
             _ = self.turned_rest if self.turns else self.rest_factor
+        if self._touched is None and self.accelerator is not None:
+            self._touched = TouchedDofs(self, self._contact.points)
 
     def under(self, motion: Array) -> Self:
         """Return the model with the instrument displaced by (3,), m."""
@@ -176,6 +209,32 @@ class ContactModel(FullOrderModel):
     def reaction(self, q: Array) -> Array:
         """Return the force (3,), N, of the body on the instrument at displacements q (n_free,)."""
         return np.asarray(-self.touch(q).forces.sum(axis=0))
+
+    def contact_force(self, touch: Touch) -> Array:
+        """Return the forces (n_free,), N, of a contact on the body."""
+        return self._contact.force(touch)
+
+    def quickly(self, start: Array, tolerance: float) -> Attempt:
+        if self._touched is None:
+            return Attempt(start, 1.0, 0, converged=False)
+        found = accelerated_contact(self, self._touched, start, tolerance)
+        stable = found.valid and self._is_stable(found.q, self._touched)
+        return replace(found, converged=stable)
+
+    def _is_stable(self, q: Array, touched: TouchedDofs) -> bool:
+        """Return whether no negative curvature was found at q."""
+        force = np.random.default_rng(0).normal(size=self.n_unknowns)
+        tangent, touch = self.linearise(q)[1], self.touch(q)
+        try:
+            if self.iterative and len(touch.points):
+                inverse = PressedInverse(self.turned_rest.at(q), touched, touch)
+                pattern = self.assembler.pattern
+                conjugate_gradients(pattern, tangent, inverse, force, CERTIFY_TOLERANCE)
+            else:
+                self.step(q, tangent, force, CERTIFY_TOLERANCE)
+        except NotPositiveDefiniteError:
+            return False
+        return True
 
     def force(self, q: Array) -> State:
         return self._pressed(super().force(q), self.touch(q))

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.counting import count
@@ -84,7 +85,7 @@ class ContactPoints:
     UnsupportedSceneError
         If no instrument presses the scene.
     SpecError
-        If the instrument penetrates the body at rest under gravity.
+        If the instrument penetrates the body at rest under its pre-load.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -97,7 +98,7 @@ class ContactPoints:
             if deepest > ROUND_OFF * float(np.ptp(self._points, axis=0).max()):
                 raise SpecError(
                     f"{scene.name}: `loads.instrument` must not penetrate the body at rest under "
-                    f"gravity; it does, by {deepest:.6g} m."
+                    f"its pre-load; it does, by {deepest:.6g} m."
                 )
 
     def first_step(self, motion: Array) -> float:
@@ -172,6 +173,9 @@ class ContactMap:
         self._values[row, column] = values.data
         self.dofs = np.full((len(counts), width, 3), n, dtype=np.int64)
         self.dofs[row, column] = dof_of_node[values.indices]
+        at = dofs_of_nodes(row), dof_of_node[values.indices].ravel()
+        shape = (3 * len(counts), n + 1)
+        self._moving = sp.csr_array((np.repeat(values.data, 3), at), shape=shape)[:, :n]
 
     def touch(self, q: Array, motion: Array) -> Touch:
         """Return the contact at displacements q (n,), m, of the body and (3,), m, of its motion."""
@@ -183,7 +187,7 @@ class ContactMap:
 
     def _moved(self, q: Array) -> Array:
         count(multiply_adds=3 * self._values.size)
-        return np.asarray(np.einsum("pa,pai->pi", self._values, np.append(q, 0.0)[self.dofs]))
+        return np.asarray(self._moving @ q).reshape(-1, 3)
 
     def force(self, touch: Touch) -> Array:
         """Return the forces (n,), N, on the body."""
@@ -200,6 +204,18 @@ class ContactMap:
         own = pairs * touch.blocks(curved)[:, None, :, None, :]
         count(multiply_adds=own.size)
         return np.asarray(own.reshape(-1, width, width))
+
+    def dense(self, touch: Touch, curved: bool) -> tuple[NDArray[np.int64], Array]:
+        """Return the dofs (m,) that touch, and the stiffness (m, m) over them, N/m."""
+        own = self.dofs[touch.points].reshape(-1, 3 * self.dofs.shape[1])
+        used = np.unique(own)
+        used = used[used < self._n]
+        place = np.full(self._n + 1, len(used))
+        place[used] = np.arange(len(used))
+        local, size = place[own], len(used) + 1
+        at = (local[:, :, None] * size + local[:, None, :]).ravel()
+        found = np.bincount(at, self.blocks(touch, curved).ravel(), size**2)
+        return used, np.asarray(found.reshape(size, size)[:-1, :-1])
 
 
 class NodalContact(ContactMap):

@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import UnsupportedSceneError
 from mor_bench.mechanics.elements import element_of, shape_gradients
+from mor_bench.scene.constant_pressures import HeldPressure, followers_of
 from mor_bench.scene.interpolation import trilinear
 from mor_bench.scene.materials import Material
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import NO_EQUATIONS
 
 Array = NDArray[np.float64]
+
+FOLLOWS = "its pressures follow the surface, and the method solves for dead loads only"
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,8 @@ class Discretisation:
         locking of H8.
     springs : (n_dofs, n_dofs) sparse float64, optional
         Stiffness of springs on the surface, N/m.
+    followers : tuple of HeldPressure
+        Constant pressures that follow the surface. Their forces count as internal ones.
     rest : (n_nodes, 3) float64, optional
         Displacements of a rest state under a constant pre-load, m. Displacements and forces are
         then measured from it.
@@ -48,6 +53,7 @@ class Discretisation:
     material: Material
     selective: bool = False
     springs: sp.csr_array | None = None
+    followers: tuple[HeldPressure, ...] = ()
     rest: Array | None = None
     positions: Array | None = None
 
@@ -65,14 +71,34 @@ def discretisation_of(
     Raises
     ------
     UnsupportedSceneError
-        If the scene's snapshots were imported, so that its equations are unknown.
+        If the scene's snapshots were imported, so that its equations are unknown; or for chosen
+        cells, if a constant pressure follows the surface.
     """
     if scene.material is None:
         raise UnsupportedSceneError(f"{scene.name}: {NO_EQUATIONS}.")
-    mesh = scene.mesh
+    mesh, followers = scene.mesh, followers_of(scene.constant_pressures)
+    if followers and not isinstance(chosen, slice):
+        raise UnsupportedSceneError(f"{scene.name}: {FOLLOWS}.")
     return Discretisation(
-        mesh.points, mesh.cells[chosen], scene.material, scene.selective, scene.spring_matrix
+        mesh.points,
+        mesh.cells[chosen],
+        scene.material,
+        scene.selective,
+        scene.spring_matrix,
+        followers,
     )
+
+
+def constant_forces(scene: Scene) -> Array:
+    """Return the weight and the constant dead pressures as nodal forces (n_nodes, 3), N."""
+    gravity, found = scene.generated.gravity, np.zeros((scene.mesh.n_nodes, 3))
+    if gravity is not None:
+        density = gravity.density_kg_m3 * np.array(gravity.acceleration_m_s2)
+        found += body_force(discretisation_of(scene), density)
+    for held in scene.constant_pressures:
+        if not held.follower:
+            found += held.dead_forces(scene.mesh)
+    return found
 
 
 def body_force(body: Discretisation, density: Array) -> Array:

@@ -8,18 +8,13 @@ from numpy.typing import NDArray
 from mor_bench.counting import count, uncounted
 from mor_bench.errors import NoEquilibriumError, UnsupportedSceneError
 from mor_bench.mechanics.compliance import Compliance
-from mor_bench.mechanics.contact_points import ContactMap, ContactPoints, Touch, motion_of
+from mor_bench.mechanics.contact_balance import Balance, DenseFlexibility
+from mor_bench.mechanics.contact_points import ContactMap, ContactPoints, motion_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene
 
 Array = NDArray[np.float64]
-
-TOLERANCE = 1e-10
-"""Change of the contact's forces in a step, relative to them, at which the iteration ends."""
-
-MAX_ITERATIONS = 100
-MAX_HALVINGS = 20
 
 LEAST_STEP = 1e-3
 """Smallest step of the instrument, as a fraction of its motion, before the solve gives up."""
@@ -30,9 +25,7 @@ CHUNK = 256
 class LinearContact:
     """K₀ u = f(u), with the stiffness at rest K₀ and the contact's forces f.
 
-    With the compliance C = K₀⁻¹ at the dofs that the instrument may touch, u = C f. Newton's steps
-    solve (1 + C K) δ = C f - u, where K is the contact's stiffness at the few dofs that touch. K
-    leaves out the curvature of the instrument where a step would not descend on the potential.
+    With the compliance C = K₀⁻¹ at the dofs that the instrument may touch, u = C f; see `Balance`.
 
     Parameters
     ----------
@@ -57,6 +50,7 @@ class LinearContact:
         number = np.full(scene.mesh.n_dofs, n, dtype=np.int64)
         number[dofs] = np.arange(n)
         self._contact = ContactMap(ContactPoints(scene), number.reshape(-1, 3), n)
+        self._balance = Balance(self._contact, DenseFlexibility(self._flexibility))
 
     def respond(self, loads: Array, /) -> Array:
         """Return the responses (n, n_dofs), m, to displacements of the instrument of that shape.
@@ -86,7 +80,9 @@ class LinearContact:
         while reached < 1.0:
             place = 1.0 if reached + 1.001 * step > 1.0 else reached + step
             before = self._contact.normals(self._flexibility @ forces, reached * motion)
-            found = self._settled(place * motion, forces)
+            u = self._flexibility @ forces
+            count(multiply_adds=self._flexibility.size)
+            found = self._balance.settle(u, forces, place * motion)
             if found is not None and not self._passed(found, place * motion, before):
                 reached, forces = place, found
             elif (step := 0.5 * step) < LEAST_STEP:
@@ -95,32 +91,6 @@ class LinearContact:
                     f"side of the instrument, beyond {reached:.0%} of the motion."
                 )
         return forces
-
-    def _settled(self, motion: Array, forces: Array) -> Array | None:
-        """Iterate from the forces (n,), N, at another place; None if that does not converge."""
-        u = self._flexibility @ forces
-        touch = self._contact.touch(u, motion)
-        for _ in range(MAX_ITERATIONS):
-            wanted = self._contact.force(touch)
-            excess = wanted - forces
-            if float(np.linalg.norm(excess)) <= TOLERANCE * float(np.linalg.norm(wanted)):
-                return wanted
-            for curved in (True, False):
-                change = self._newton(touch, wanted, excess, curved) - forces
-                step = self._flexibility @ change
-                count(multiply_adds=self._flexibility.size)
-                if (slope := float(excess @ step)) > 0:
-                    break
-            before = 0.5 * float(forces @ u) + touch.energy_j
-            for halving in range(MAX_HALVINGS):
-                length = 0.5**halving
-                other, moved = forces + length * change, u + length * step
-                touch = self._contact.touch(moved, motion)
-                left = float((self._contact.force(touch) - other) @ step)
-                if 0.5 * float(other @ moved) + touch.energy_j <= before or abs(left) <= slope:
-                    break
-            forces, u = other, moved
-        return None
 
     def _passed(self, forces: Array, motion: Array, before: Array) -> bool:
         """Return whether the surface got past the instrument's centre since these normals (n, 3).
@@ -131,25 +101,3 @@ class LinearContact:
         count(multiply_adds=self._flexibility.size)
         touch = self._contact.touch(u, motion)
         return bool(((touch.normals * before[touch.points]).sum(axis=1) < 0).any())
-
-    def _newton(self, touch: Touch, wanted: Array, excess: Array, curved: bool) -> Array:
-        """Return the forces of the equilibrium with the contact linearised."""
-        dofs = self._contact.dofs
-        own = dofs[touch.points].reshape(-1, 3 * dofs.shape[1])
-        used = np.unique(own)
-        used = used[used < len(wanted)]
-        if not len(used):
-            return wanted
-        place = np.full(len(wanted) + 1, len(used))
-        place[used] = np.arange(len(used))
-        local, size = place[own], len(used) + 1
-        at = (local[:, :, None] * size + local[:, None, :]).ravel()
-        blocks = self._contact.blocks(touch, curved).ravel()
-        stiffness = np.bincount(at, blocks, size**2).reshape(size, size)[:-1, :-1]
-        compliance = self._flexibility[np.ix_(used, used)]
-        system = np.eye(len(used)) + compliance @ stiffness
-        moved = np.linalg.solve(system, self._flexibility[used] @ excess)
-        count(factorisations=1, multiply_adds=len(used) ** 3 + len(used) * len(wanted))
-        found = wanted.copy()
-        found[used] -= stiffness @ moved
-        return found

@@ -1,11 +1,20 @@
-"""Warning about a discretisation that is too stiff for a nearly incompressible material."""
+"""Warnings about a body whose discretisation or stiffness costs accuracy."""
 
 from __future__ import annotations
 
 import warnings
 
-from mor_bench.errors import LockingWarning
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import IllConditionedWarning, LockingWarning
+from mor_bench.mechanics.banded import BandedFactor
+from mor_bench.mechanics.pattern import Pattern
+from mor_bench.mechanics.rotated import condition_number
 from mor_bench.scene.scene import Scene
+
+ILL_CONDITIONED = 1e10
+"""Condition number above which solutions miss the default tolerance."""
 
 LOCKING_FROM = 0.45
 """Poisson's ratio above which H8 with full integration and T4 lock in volume; T10 do not."""
@@ -33,3 +42,18 @@ def warn_of_locking(scene: Scene) -> None:
     risk = locking_risk(scene)
     if risk:
         warnings.warn(risk, LockingWarning, stacklevel=3)
+
+
+def warn_if_ill_conditioned(
+    name: str, pattern: Pattern, tangent: NDArray[np.float64], factor: BandedFactor
+) -> None:
+    """Warn of a scene whose stiffness at rest is too ill-conditioned for the default tolerance."""
+    condition = condition_number(pattern, tangent, factor)
+    if condition > ILL_CONDITIONED:
+        digits = max(0, int(15.9 - np.log10(condition)))
+        warnings.warn(
+            f"{name}: the condition number of the stiffness at rest is about {condition:.0e}, "
+            f"above {ILL_CONDITIONED:.0e}: displacements have about {digits} correct digits.",
+            IllConditionedWarning,
+            stacklevel=4,
+        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -16,8 +15,6 @@ from numpy.typing import NDArray
 
 from mor_bench.counting import uncounted
 from mor_bench.errors import (
-    IllConditionedWarning,
-    LockingWarning,
     MissingDependencyError,
     SolverError,
     SpecError,
@@ -26,7 +23,11 @@ from mor_bench.errors import (
 from mor_bench.machine import kernels_alone
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.banded import BandedCholesky, BandedFactor
-from mor_bench.mechanics.discretisation import Discretisation, body_force, discretisation_of
+from mor_bench.mechanics.discretisation import (
+    FOLLOWS,
+    Discretisation,
+    discretisation_of,
+)
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.linear import (
     Factor,
@@ -35,18 +36,19 @@ from mor_bench.mechanics.linear import (
     Pardiso,
     SparseLU,
 )
-from mor_bench.mechanics.locking import warn_of_locking
+from mor_bench.mechanics.locking import warn_if_ill_conditioned, warn_of_locking
 from mor_bench.mechanics.multigrid import Multigrid, MultigridFactor
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibria, solve_equilibrium
+from mor_bench.mechanics.rest_state import solved_at_rest
 from mor_bench.mechanics.rigid_motions import check_supports
 from mor_bench.mechanics.rotated import (
     BlockJacobi,
     JacobiFactor,
     RotatedRest,
-    condition_number,
     conjugate_gradients,
 )
 from mor_bench.mechanics.warping import warp_of
+from mor_bench.scene.constant_pressures import followers_of
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import CONTACT, NO_EQUATIONS, NO_FORCES, SolverName
 
@@ -77,12 +79,6 @@ PCG_FROM = 3000
 """Number of unknowns above which conjugate gradients beat a banded factor per Newton step."""
 JACOBI_ITERATIONS = 20_000
 CERTIFY_TOLERANCE = 1e-2
-REST_TOLERANCE = 1e-12
-"""Residual of the rest state under gravity, relative to the weight."""
-ILL_CONDITIONED = 1e10
-"""Condition number above which solutions miss the default tolerance."""
-
-FOLLOWS = "its pressures follow the surface, and the method solves for dead loads only"
 
 
 def missing_library(solver: SolverName) -> str | None:
@@ -90,6 +86,9 @@ def missing_library(solver: SolverName) -> str | None:
     if solver == "pardiso" and find_spec("pypardiso") is None:
         return "the solver `pardiso` needs pypardiso: pip install 'mor-bench[mkl]'"
     return None
+
+
+_BODIES = "an instrument presses bodies that vary between samples"
 
 
 def unknown_equations(scene: Scene, *, observed: bool = False, contact: bool = False) -> str | None:
@@ -106,46 +105,48 @@ def unknown_equations(scene: Scene, *, observed: bool = False, contact: bool = F
     """
     if scene.material is None:
         return NO_EQUATIONS
-    if observed or (contact and scene.contact):
-        return None
+    if observed:  # known displacements tell nothing about pressures that vary
+        return FOLLOWS if scene.follows and scene.observed_nodes is not None else None
+    if contact and scene.contact:
+        if followers_of(scene.constant_pressures):
+            return FOLLOWS
+        return _BODIES if scene.parameter_names else None
     if scene.contact:
         return CONTACT
-    if scene.follows:
+    if scene.follows or followers_of(scene.constant_pressures):
         return FOLLOWS
     return None if scene.observed_nodes is None else NO_FORCES
 
 
 def rest_displacement(scene: Scene) -> NDArray[np.float64] | None:
-    """Return the displacements (n_nodes, 3) of the rest state under gravity, m.
+    """Return the displacements (n_nodes, 3) of the rest state under the pre-load, m.
 
-    It is solved for once. Returns None for a scene without gravity.
+    The pre-load is gravity and constant pressures. It is solved for once. Returns None for a scene
+    without any.
 
     Raises
     ------
     SolverError
-        If the body has no stable equilibrium under its own weight.
+        If the body has no stable equilibrium under the pre-load.
     """
-    gravity = scene.generated.gravity
-    if gravity is None:
+    if not scene.generated.is_preloaded:
         return None
     if "rest" not in scene.memo:
-        density = gravity.density_kg_m3 * np.array(gravity.acceleration_m_s2)
-        weight = scene.at_free_dofs(body_force(discretisation_of(scene), density).reshape(1, -1))[0]
-        alone = {"gravity": None, "loads": None}
-        spec, found = scene.generated.model_copy(update=alone), np.zeros(0)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", LockingWarning)  # the model under gravity warns
-            light = FullOrderModel(replace(scene, spec=spec), "auto")
         try:
-            found = light.solve(weight, options=NewtonOptions(REST_TOLERANCE)).displacement
+            found = solved_at_rest(scene, FullOrderModel)
         except SolverError as error:
-            raise SolverError(f"{scene.name}: no rest state under gravity: {error}") from None
-        scene.memo["rest"] = scene.at_all_dofs(found[None])[0]
+            causes = {
+                "gravity": scene.generated.gravity,
+                "constant pressures": scene.constant_pressures,
+            }
+            acting = " and ".join(name for name, given in causes.items() if given)
+            raise SolverError(f"{scene.name}: no rest state under {acting}: {error}") from None
+        scene.memo["rest"] = found
     return scene.memo["rest"].reshape(-1, 3)
 
 
 def body_of(scene: Scene, chosen: NDArray[np.int64] | slice = slice(None)) -> Discretisation:
-    """Return the discretisation of a scene's cells, measured from its rest state under gravity."""
+    """Return the discretisation of a scene's cells, measured from its rest state."""
     body = discretisation_of(scene, chosen)
     return replace(body, rest=rest_displacement(scene))
 
@@ -153,8 +154,8 @@ def body_of(scene: Scene, chosen: NDArray[np.int64] | slice = slice(None)) -> Di
 class FullOrderModel:
     """Finite-element model of a scene under dead loads; its unknowns are the free dofs.
 
-    Under gravity, displacements and forces are measured from the rest state, so that no load
-    causes no displacement.
+    Under a pre-load, displacements and forces are measured from the rest state, so that no load
+    causes no displacement. Constant pressures that follow the surface count as internal forces.
 
     Parameters
     ----------
@@ -205,9 +206,10 @@ class FullOrderModel:
                 turn = scene.frames.matrix(mesh.n_nodes)
                 springs = sp.csr_array(turn @ springs @ turn.T)
             self.springs = springs[free][:, free]
-        self._points = mesh.points if body.rest is None else mesh.points + body.rest
+        self.points = mesh.points if body.rest is None else mesh.points + body.rest
         self.assembler = Assembler(body, dof_of_node, self.n_unknowns, frames=scene.frames)
         self.extent = self.assembler.extent_m
+        self.linear_at_rest = not body.followers  # the skew part of their tangent is left out
         self._direct = self._direct_solver()
 
     def _direct_solver(self) -> LinearSolver:
@@ -249,20 +251,10 @@ class FullOrderModel:
                 "too slender."
             ) from None
         if isinstance(factor, BandedFactor):
-            self._warn_if_ill_conditioned(factor)
-        return factor
-
-    def _warn_if_ill_conditioned(self, factor: BandedFactor) -> None:
-        condition = condition_number(self.assembler.pattern, self.rest_tangent, factor)
-        if condition > ILL_CONDITIONED:
-            digits = max(0, int(15.9 - np.log10(condition)))
-            warnings.warn(
-                f"{self.scene.name}: the condition number of the stiffness at rest is "
-                f"about {condition:.0e}, above {ILL_CONDITIONED:.0e}: displacements have "
-                f"about {digits} correct digits.",
-                IllConditionedWarning,
-                stacklevel=3,
+            warn_if_ill_conditioned(
+                self.scene.name, self.assembler.pattern, self.rest_tangent, factor
             )
+        return factor
 
     def prepare(self) -> None:
         """Compute the factors that all solves share, and load all kernels, so no query has to."""
@@ -294,7 +286,7 @@ class FullOrderModel:
         assert isinstance(factor, BandedFactor | MultigridFactor)
         single, cells, narrow = factor.single_precision(), self.turning_cells, self._narrow
         if self.moving_frames is None and narrow.node_entries <= MAX_BAND_ENTRIES:
-            warp = warp_of(self._points, self.scene.mesh.cells, cells, pattern, narrow.place)
+            warp = warp_of(self.points, self.scene.mesh.cells, cells, pattern, narrow.place)
         return RotatedRest(single, pattern, cells, self.moving_frames, warp)
 
     @property
@@ -316,7 +308,7 @@ class FullOrderModel:
         """The cells' moving nodes, and gradients and volumes at the centres; see `RotatedRest`."""
         mesh = self.scene.mesh
         element = element_of(mesh.cells)
-        gradients, det_j = shape_gradients(self._points, mesh.cells, element.centre[None])
+        gradients, det_j = shape_gradients(self.points, mesh.cells, element.centre[None])
         number = np.full(mesh.n_nodes, len(self.moving_nodes), dtype=np.int32)
         number[self.moving_nodes] = np.arange(len(self.moving_nodes))
         return number[mesh.cells], gradients[:, 0], det_j[:, 0] * element.weights.sum()

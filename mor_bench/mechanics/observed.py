@@ -97,7 +97,7 @@ class _HiddenModel(FullOrderModel):
 
     def __init__(self, whole: FullOrderModel, scene: Scene, solver: SolverName | None) -> None:
         super().__init__(scene, solver)
-        self._whole = whole
+        self._whole, self.linear_at_rest = whole, whole.linear_at_rest
         self.hidden = np.searchsorted(whole.scene.free_dofs, scene.free_dofs)
         inside = np.zeros(whole.n_unknowns, dtype=bool)
         inside[self.hidden] = True
@@ -174,8 +174,11 @@ class ObservedModel:
         whole = FullOrderModel(scene, solver)
         held = replace(
             scene,
-            # The whole model has the rest state under gravity, and moves the tool.
-            spec=scene.generated.model_copy(update={"gravity": None, "loads": None}),
+            # The whole model has the rest state, and moves the tool.
+            spec=scene.generated.model_copy(
+                update={"gravity": None, "constant_pressures": (), "loads": None}
+            ),
+            constant_pressures=(),
             fixed_nodes=np.union1d(scene.fixed_nodes, scene.observed_nodes),
         )
         with warnings.catch_warnings():
@@ -327,35 +330,3 @@ def generating_model(scene: Scene) -> FullOrderModel | ObservedModel:
     if scene.contact:
         return _contact_model(scene, None)
     return ObservedModel(scene) if scene.motion else full_order_model(scene)
-
-
-class ToolForces:
-    """Forces of a moved tool, or an instrument, on its nodes: the internal forces there.
-
-    Their sum is minus the reaction that the tool feels. Foundations resist, and gravity acts, as
-    part of the internal forces. At an equilibrium they are the forces of the contact.
-
-    Parameters
-    ----------
-    scene : Scene
-        A scene with a moved tool, or an instrument that presses.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        moved = scene.motion or scene.contact
-        if moved is None or scene.observed_nodes is None:
-            raise UnsupportedSceneError(f"{scene.name}: no tool moves the body.")
-        self._model, self._nodes = FullOrderModel(scene), scene.observed_nodes
-
-    def __call__(self, displacements: Array) -> Array:
-        """Return the forces (n, n_nodes, 3), N, at displacements (n, n_free) of the free dofs, m.
-
-        They are zero at all other nodes, and NaN where the displacements are not finite.
-        """
-        scene = self._model.scene
-        forces = np.zeros((len(displacements), scene.mesh.n_nodes, 3))
-        for row, u in zip(forces, displacements, strict=True):
-            finite = bool(np.isfinite(u).all())
-            force = self._model.force(u).force if finite else np.full(len(u), np.nan)
-            row[self._nodes] = scene.at_all_dofs(force[None]).reshape(-1, 3)[self._nodes]
-        return forces

@@ -1,7 +1,7 @@
 """Equilibria of a parametric scene: each load acts on a body with its own parameters.
 
 The laws of Young's modulus and Poisson's ratio are linear in Young's modulus Y. So without springs
-and gravity, the displacement under a load f with Y is that under f Y₀ / Y with Y₀, exactly. Bodies
+and pre-load, the displacement under a load f with Y is that under f Y₀ / Y with Y₀, exactly. Bodies
 that differ in nothing else share one model. Every other body has a model of its own, with the
 sparsity pattern of the reference. The reference's factor preconditions its iterations. This takes
 less counted work than a factor for each body, except on small meshes at tight tolerances, and where
@@ -23,7 +23,7 @@ from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.discretisation import Discretisation
 from mor_bench.mechanics.model import FullOrderModel, body_of
 from mor_bench.mechanics.newton import NewtonOptions, Solution, checked_load
-from mor_bench.mechanics.observed import ObservedModel, generating_model, linear_response
+from mor_bench.mechanics.observed import ObservedModel, linear_response
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.scene_at import reference_parameters, scale_of, scene_at
 from mor_bench.specs import SolverName
@@ -46,7 +46,9 @@ class Bodies:
     def __init__(self, scene: Scene) -> None:
         self.scene, self.reference = scene, reference_parameters(scene)
         spec, names = scene.generated, scene.parameter_names
-        scales = "young_pa" in names and not spec.springs and spec.gravity is None
+        penalty = getattr(spec.loads, "penalty_n_m3", None)  # does not change with the modulus
+        others = spec.springs or spec.is_preloaded or penalty is not None
+        scales = "young_pa" in names and not others
         self._young = names.index("young_pa") if scales else None
 
     def shared(self, parameters: Array) -> tuple[Array, float]:
@@ -206,8 +208,3 @@ class OneBody:
 
     def solve_many(self, loads: Array, parameters: Array, /) -> list[Solution | SolverError]:
         return self.model.solve_many(loads)
-
-
-def generator_of(scene: Scene) -> Generator:
-    """Return the model whose input are a scene's sampled loads and parameters."""
-    return ParametricModel(scene) if scene.parameter_names else OneBody(generating_model(scene))

@@ -59,10 +59,13 @@ class Problem(Protocol):
     n_unknowns : int
     extent : float
         Unknowns of this size are displacements of the size of the body.
+    linear_at_rest : bool
+        Whether ``rest_factor`` holds the whole derivative of the force at rest.
     """
 
     n_unknowns: int
     extent: float
+    linear_at_rest: bool
 
     @property
     def accelerator(self) -> Turning | None:
@@ -115,4 +118,4 @@ def is_round_off(step: Array, q: Array, extent: float = 0.0) -> bool:
 
 def is_linear(problem: Problem, q: Array) -> bool:
     """Return whether a linear response is so small that it solves the nonlinear problem."""
-    return float(np.abs(q).max()) <= LINEAR * problem.extent
+    return problem.linear_at_rest and float(np.abs(q).max()) <= LINEAR * problem.extent

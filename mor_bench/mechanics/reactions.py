@@ -7,9 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.errors import InvalidInputError, UnsupportedSceneError
 from mor_bench.mechanics.assembly import Assembler
-from mor_bench.mechanics.discretisation import body_force, discretisation_of
+from mor_bench.mechanics.discretisation import constant_forces, discretisation_of
 from mor_bench.mechanics.model import rest_displacement
-from mor_bench.mechanics.pressed import PressedFacets, PressedModel
+from mor_bench.mechanics.pressed import PressedModel
+from mor_bench.mechanics.pressed_facets import PressedFacets
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import NO_EQUATIONS
 
@@ -19,9 +20,9 @@ Array = NDArray[np.float64]
 class Reactions:
     """Computes the forces of the supports, f_int(u) - f, along the directions that they hold.
 
-    The internal force contains that of springs. Weight counts to the forces, and pressures that
-    follow the surface act on the deformed one. So at an equilibrium, the reactions, the forces, the
-    weight and the forces of the springs on the body have no resultant and no moment.
+    The internal force contains that of springs. Weight and constant pressures count to the forces,
+    and pressures that follow the surface act on the deformed one. So at an equilibrium, the
+    reactions, these forces and those of the springs on the body have no resultant and no moment.
 
     Parameters
     ----------
@@ -39,11 +40,9 @@ class Reactions:
         body, n_dofs = discretisation_of(scene), scene.mesh.n_dofs
         numbers = np.arange(n_dofs).reshape(-1, 3)
         self._scene, self._assembler = scene, Assembler(body, numbers, n_dofs)
-        self._rest, self._weight = np.zeros(n_dofs), np.zeros(n_dofs)
-        gravity, rest = scene.generated.gravity, rest_displacement(scene)
-        if gravity is not None and rest is not None:
-            density = gravity.density_kg_m3 * np.array(gravity.acceleration_m_s2)
-            self._rest, self._weight = rest.ravel(), body_force(body, density).ravel()
+        self._rest, self._constant = np.zeros(n_dofs), constant_forces(scene).ravel()
+        if (rest := rest_displacement(scene)) is not None:
+            self._rest = rest.ravel()
         self._pressed: tuple[PressedModel, PressedFacets] | None = None
         if scene.follows:
             points = scene.mesh.points + self._rest.reshape(-1, 3)
@@ -57,7 +56,7 @@ class Reactions:
         Parameters
         ----------
         displacements, forces : (n, n_nodes, 3) float64
-            Displacements, m, and forces, N, as of `Snapshots`: without the rest state and weight.
+            Displacements, m, and forces, N, as of `Snapshots`: without the rest state and pre-load.
 
         Raises
         ------
@@ -81,7 +80,7 @@ class Reactions:
             pressures = model.pressures_of(self._scene.at_free_dofs(force[None])[0])
             force = facets.force(u, pressures)
         internal = self._assembler.force(self._rest + u).force
-        return np.asarray(internal - self._weight - force)
+        return np.asarray(internal - self._constant - force)
 
 
 def reaction_forces(scene: Scene, displacements: ArrayLike, forces: ArrayLike) -> Array:

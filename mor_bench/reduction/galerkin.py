@@ -84,6 +84,7 @@ class DenseProblem(ABC):
     accelerator = None
     n_unknowns: int
     extent: float
+    linear_at_rest = True
 
     @property
     @abstractmethod

@@ -19,6 +19,7 @@ from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.contact import solve_contact
 from mor_bench.mechanics.contact_points import ContactPoints, Touch, motion_of
 from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.mechanics.problem import Attempt
 from mor_bench.reduction.galerkin import DenseProblem
 from mor_bench.scene.scene import Scene
 
@@ -86,6 +87,10 @@ class PressedModes(DenseProblem):
     def _pressed(self, state: State, touch: Touch, modes: Array) -> State:
         force = state.force - self._force(touch, modes)
         return State(force, state.energy_j + touch.energy_j, state.min_det_f)
+
+    def quickly(self, start: Array, tolerance: float) -> Attempt:
+        """Do nothing: a reduced model has no accelerated iteration."""
+        return Attempt(start, 1.0, 0, converged=False)
 
     def solve(self, given: Array, options: NewtonOptions) -> Array:
         """Return coordinates (r,) for a displacement of the instrument at the free dofs, (n_free,).

@@ -67,6 +67,7 @@ def scene_text(content: Mapping[str, Any]) -> str:
         _supports(spec),
         "under gravity" if spec.gravity else "",
         "on springs" if spec.springs else "",
+        "under constant pressures" if spec.constant_pressures else "",
         f"with {_loads(spec.loads)}{_parameters(spec)}.",
     ]
     text = " ".join(filter(None, parts))

@@ -25,7 +25,7 @@ from mor_bench.measure.latency import (
 from mor_bench.measure.machine_speed import MachineSpeed, recorded_machines
 from mor_bench.measure.method_session import SETTLE_QUERIES
 from mor_bench.measure.timing import BATCHES
-from mor_bench.mechanics.parametric import generator_of
+from mor_bench.mechanics.moved_bodies import generator_of
 from mor_bench.runs.cached_fit import FitRecord, read_fit_record
 from mor_bench.runs.compilation import uncompiled
 from mor_bench.runs.configurations import OWN, Configuration, may_train

@@ -76,7 +76,7 @@ def _generated(spec: DatasetSpec) -> str:
         if scene.contact and scene.observed_nodes is not None:
             from mor_bench.mechanics.contact_points import ContactPoints  # other scenes need none
 
-            ContactPoints(scene)  # does the instrument penetrate the body at rest under gravity?
+            ContactPoints(scene)  # does the instrument penetrate the body at rest?
             loaded = f"{len(scene.observed_nodes)} nodes to touch"
         if scene.pressure:
             loaded = f"{len(scene.pressure.regions)} pressed regions"

@@ -95,7 +95,8 @@ class _Scorer:
                 predicted = self._predictions(test, chunk, left_s, out)
                 references = test.references[chunk]
                 errors.append(sample_errors(predicted, references, test.nodes, test.fixed_nodes))
-                derived.append(data.derived_errors(predicted, references))
+                bodies = test.queries(chunk)["parameters"]
+                derived.append(data.derived_errors(predicted, references, bodies))
                 worst.look_at(start, errors[-1].mean_dof_m, predicted)
                 indicated.add(start, forces, predicted)
                 found = self.worker.ask("flag", LOAD_LIMIT_S, **test.queries(chunk))["flagged"]

@@ -182,12 +182,18 @@ class TrainingData:
         return StressErrors(self.scene) if self.scene.spec.needs.stress else None
 
     def derived_errors(
-        self, predicted: NDArray[np.float64], references: NDArray[np.float64]
+        self,
+        predicted: NDArray[np.float64],
+        references: NDArray[np.float64],
+        parameters: NDArray[np.float64] | None = None,
     ) -> dict[str, NDArray[np.float64]]:
-        """Return relative errors (n,) of what follows from displacements (n, n_nodes, 3)."""
+        """Return relative errors (n,) of what follows from displacements (n, n_nodes, 3).
+
+        Bodies with sampled parameters need these, (n, n_parameters).
+        """
         found = {}
         if self.reaction_errors:
-            found["reaction_relative"] = self.reaction_errors(predicted, references)
+            found["reaction_relative"] = self.reaction_errors(predicted, references, parameters)
         if self.stress_errors:
             names = "stress_relative", "peak_stress_relative", "peak_tension_relative"
             found |= zip(names, self.stress_errors(predicted, references), strict=True)

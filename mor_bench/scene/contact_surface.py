@@ -122,6 +122,8 @@ class ContactSurface:
         Penalty stiffness times area, N/m.
     penalty_n_m3 : float
         The penalty stiffness, N/m³.
+    axis : (3,) float64
+        Unit vector in the middle of the instrument's motions.
     """
 
     instrument: Instrument
@@ -129,6 +131,7 @@ class ContactSurface:
     values: sp.csr_array
     stiffness: Array
     penalty_n_m3: float
+    axis: Array
 
     @property
     def gaps_at_rest(self) -> Array:
@@ -196,7 +199,8 @@ def contact_surface(
         values = sp.csr_array((entries, at), shape=(len(points), mesh.n_nodes))
     else:
         values = interpolation_matrix(mesh, points)
-    return ContactSurface(instrument, points, values, penalty * areas, float(penalty))
+    axis = unit(plan.direction or (-vectors[instrument.gaps(points)[0].argmin()]).tolist())
+    return ContactSurface(instrument, points, values, penalty * areas, float(penalty), axis)
 
 
 def _misplaced(plan: Contact, instrument: Instrument, points: Array) -> list[str]:
@@ -238,7 +242,7 @@ def touched_nodes(
     """
     nodes = surface.nodes
     free = ~np.isin(3 * nodes[:, None] + np.arange(3), fixed_dofs)
-    axis, spread = unit(plan.direction), np.deg2rad(min(plan.spread_deg, 90.0))
+    axis, spread = surface.axis, np.deg2rad(min(plan.spread_deg, 90.0))
     most = np.abs(axis) * np.cos(spread) + np.sqrt(np.maximum(1 - axis**2, 0)) * np.sin(spread)
     held = [AXES[i] for i in range(3) if not free[:, i].any() and most[i] > ROUND_OFF]
     if held:

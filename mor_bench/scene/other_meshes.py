@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
+from mor_bench.scene.constant_pressures import pressures_on_parts
 from mor_bench.scene.scene import Scene, scene_without_patches
 from mor_bench.scene.springs import on_parts
 from mor_bench.scene.subdivision import subdivide
@@ -86,14 +87,16 @@ def refined(scene: Scene) -> Scene:
     }
     held = Held(scene.fixed_nodes, scene.held_dofs, scene.frames)
     finer = held_by_parents(scene.mesh.n_nodes, held, parents)
-    springs = scene.springs
+    springs, pressures = scene.springs, scene.constant_pressures
     if scene.embedded_surface is None:
         of_file = zip(springs, scene.generated.springs, strict=True)
         springs = tuple(on_parts(own, spring, mesh, parents) for own, spring in of_file)
+        pressures = pressures_on_parts(pressures, mesh, parents)
     return replace(
         scene,
         mesh=mesh,
         springs=springs,
+        constant_pressures=pressures,
         fixed_nodes=finer.fixed_nodes,
         held_dofs=finer.held_dofs,
         frames=finer.frames,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.scene.acting import Acting, Ground, acting_on, points_of, weights_of
 from mor_bench.scene.body import build_body
+from mor_bench.scene.constant_pressures import HeldPressure, held_pressures
 from mor_bench.scene.contact_surface import ContactSurface, contact_surface, touched_nodes
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.interpolation import interpolation_matrix
@@ -35,8 +36,8 @@ from mor_bench.specs import (
     ImportedDatasetSpec,
     Motion,
     Pressure,
+    as_spec,
     generated,
-    load_dataset_spec,
 )
 
 
@@ -63,6 +64,8 @@ class Scene:
         Named sets of nodes from a mesh file.
     springs : tuple of Springs
         Foundations.
+    constant_pressures : tuple of HeldPressure
+        Pressures that are part of the pre-load.
     memo : dict of str to float64
         Arrays that are computed once for a scene, such as its rest state under gravity.
 
@@ -82,6 +85,7 @@ class Scene:
     embedded_surface: Facets | None = None
     point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
     springs: tuple[Springs, ...] = ()
+    constant_pressures: tuple[HeldPressure, ...] = ()
     memo: dict[str, NDArray[np.float64]] = field(init=False, default_factory=dict, compare=False)
 
     def __repr__(self) -> str:
@@ -249,8 +253,8 @@ class Scene:
     def patch_nodes(self) -> NDArray[np.int64]:
         """(n_patches,) surface point at the centre of each load patch.
 
-        The index of a patch here is its load-region id. On a mesh's own boundary the points are
-        nodes. A moved tool counts as one patch, at one of its nodes; a pressure as three, at the
+        The index of a patch is its load-region id. On a mesh's own boundary the points are nodes.
+        A moved tool counts as one patch, at one of its nodes; a pressure as three, at the
         middle of its region; a line as one, at the point nearest to its middle; an instrument as
         one, at the point nearest to it. The patches of several tables follow one another.
         """
@@ -303,9 +307,8 @@ class Scene:
         """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1.
 
         They are the consistent load of a uniform traction. An embedded surface passes it to the
-        nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes, and for an
-        instrument at each node that it may touch. For a pressure they are components of area
-        vectors, m². Without a table `loads` there is no patch.
+        nodes of the surrounding cells. For a tool they are 1 at each of its nodes, for an
+        instrument at each that it may touch. For a pressure they are components of areas, m².
         """
         if self.generated.loads is None:
             return sp.csr_array((0, self.mesh.n_nodes))
@@ -323,13 +326,6 @@ class Scene:
                 with problems.keep():
                     getattr(self, name)
         return self
-
-
-def as_spec(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> AnyDatasetSpec:
-    """Return the spec of a dataset, given by name, path, dict or spec."""
-    if isinstance(source, DatasetSpec | ImportedDatasetSpec):
-        return source
-    return load_dataset_spec(source)
 
 
 def load_scene(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> Scene:
@@ -376,17 +372,20 @@ def scene_without_patches(spec: DatasetSpec) -> Scene:
 
 
 def _with_supports(spec: DatasetSpec, problems: Problems) -> Scene:
-    """Build the same scene, but leave out supports or springs with errors, which are kept."""
+    """Build the same scene, but leave out supports and such with errors, which are kept."""
     mesh, surface, point_sets = build_body(spec)
     mesh, point_sets = in_elements(spec, mesh, point_sets)
     cloud = Cloud(mesh.points, np.unique(mesh.boundary_facets), point_sets)
     held = NOTHING_HELD
     springs: tuple[Springs, ...] = ()
+    pressures: tuple[HeldPressure, ...] = ()
+    smooth = surface or Facets(mesh.points, mesh.boundary_facets)
     with problems.keep():
         held = held_by(spec.supports, cloud)
     with problems.keep():
-        smooth = surface or Facets(mesh.points, mesh.boundary_facets)
         springs = foundations(spec, smooth, point_sets)
+    with problems.keep():
+        pressures = held_pressures(spec, smooth, point_sets, embedded=surface is not None)
     return Scene(
         spec,
         mesh,
@@ -396,5 +395,6 @@ def _with_supports(spec: DatasetSpec, problems: Problems) -> Scene:
         surface,
         point_sets,
         springs,
+        pressures,
         frames=held.frames,
     )

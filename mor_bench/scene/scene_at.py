@@ -55,9 +55,9 @@ def scene_at(scene: Scene, values: NDArray[np.float64]) -> Scene:
     found = replace(
         scene,
         spec=scene.generated.model_copy(update=changed),
-        mesh=_scaled(scene.mesh, named),
+        mesh=(mesh := _scaled(scene.mesh, named)),
         material=make_material(material),
-        embedded_surface=None,
+        embedded_surface=scene.embedded_surface if mesh is scene.mesh else None,
     )
     vars(found).update({name: vars(scene)[name] for name in KEPT if name in vars(scene)})
     return found

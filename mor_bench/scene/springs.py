@@ -16,7 +16,7 @@ from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.problems import Problems
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.scene.triangle_rules import DEGREE_4, DEGREE_4_WEIGHTS, quadratic_triangle
-from mor_bench.specs import AXES, DatasetSpec
+from mor_bench.specs import AXES, DatasetSpec, Region
 from mor_bench.specs.support_spec import Spring
 
 _X, _W = np.polynomial.legendre.leggauss(3)
@@ -64,12 +64,17 @@ def foundations(
     with Problems() as problems:
         for number, spring in enumerate(spec.springs):
             with problems.keep():
-                key = f"springs[{number}].region"
-                facets = surface.within(region_points(cloud, spring.region, key))
-                if len(facets) == 0:
-                    raise SpecError(f"`{key}` holds no facet of the surface.")
+                facets = facets_in(surface, cloud, spring.region, f"springs[{number}].region")
                 found.append(_on_facets(spring, surface, facets))
     return tuple(found)
+
+
+def facets_in(surface: Facets, cloud: Cloud, region: Region, key: str) -> NDArray[np.int64]:
+    """Return the facets with all corners in a region; `SpecError` if there is none."""
+    facets = surface.within(region_points(cloud, region, key))
+    if len(facets) == 0:
+        raise SpecError(f"`{key}` holds no facet of the surface.")
+    return facets
 
 
 def matrix_of(springs: Sequence[Springs], mesh: Mesh) -> sp.csr_array | None:

@@ -40,12 +40,12 @@ class Mirror:
 def mirrors(scene: Scene) -> list[Mirror]:
     """Return the mirror planes of a scene with its loaded nodes, at most one per axis.
 
-    None are looked for where supports are oblique.
+    None are looked for where supports are oblique or constant pressures act.
 
     The image of a solution solves the image of its load, because laws are isotropic or their fibres
     have an image too. A scene with an instrument has no plane: its image is another instrument.
     """
-    if scene.frames is not None or scene.contact:
+    if scene.frames is not None or scene.contact or scene.constant_pressures:
         return []
     points, cells = scene.mesh.points, scene.mesh.cells
     low, high = points.min(axis=0), points.max(axis=0)

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError, check_count
-from mor_bench.mechanics.observed import ToolForces
-from mor_bench.scene.scene import Scene, as_spec, imported_scene, load_scene
+from mor_bench.mechanics.moved_bodies import ToolForces
+from mor_bench.scene.scene import Scene, imported_scene, load_scene
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import GenerationOptions, generate, read_shards
 from mor_bench.snapshots.given import Given, given_of
@@ -23,7 +23,7 @@ from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.sampling import n_samples_of, path_of_samples, repeated
 from mor_bench.snapshots.split import split_imported, split_samples
 from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set
-from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, SplitBy
+from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, SplitBy, as_spec
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -87,7 +87,7 @@ class Snapshots:
         if isinstance(self.loads, NodalLoads):
             return self.loads.forces
         if self.scene.motion or self.scene.contact:
-            return read_only(ToolForces(self.scene)(self.free_displacements))
+            return read_only(ToolForces(self.scene)(self.free_displacements, self.parameters))
         return read_only(self.loads.nodal_forces(self.scene.patch_weights))
 
     @property
@@ -102,16 +102,17 @@ class Snapshots:
         """Input of the methods: forces, with parameters if any, or observed displacements.
 
         Displacements are zero at all other nodes. Where an instrument presses, they are its own.
+        Displacements with parameters are `ParametricForces`.
         """
         nodes = self.scene.observed_nodes
         if nodes is None:
             return given_of(self.scene, self.forces, self.parameters)
         if self.scene.contact and isinstance(self.loads, PatchLoads):
             moved = self.loads.nodal_forces(self.scene.patch_weights)
-            return given_of(self.scene, read_only(moved))
+            return given_of(self.scene, read_only(moved), self.parameters)
         seen = np.zeros_like(self.displacements)
         seen[:, nodes] = self.displacements[:, nodes]
-        return given_of(self.scene, read_only(seen))
+        return given_of(self.scene, read_only(seen), self.parameters)
 
     @property
     def free_forces(self) -> NDArray[np.float64]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mor_bench.errors import SolverError
+from mor_bench.mechanics.moved_bodies import generator_of
 from mor_bench.mechanics.newton import Solution
-from mor_bench.mechanics.parametric import generator_of
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.sampling import draw_loads, n_samples_of, path_of_samples

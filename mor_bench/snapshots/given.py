@@ -76,12 +76,12 @@ class ObservedDisplacements(_NodalValues):
 
 @dataclass(frozen=True, eq=False)
 class ParametricForces(_NodalValues):
-    """Nodal forces with the parameters of the body that they act on.
+    """Nodal forces, or displacements of a tool, with the parameters of the body.
 
     Attributes
     ----------
     values : (n, n_nodes, 3) or (n_nodes, 3) float64
-        Forces, N.
+        Forces, N, or displacements at the observed nodes of a scene with a tool, m.
     parameters : (n, n_parameters) or (n_parameters,) float64
         Values of ``Scene.parameter_names``, one row for each load.
     """
@@ -165,7 +165,8 @@ def checked_parametric(
 ) -> ParametricForces:
     """Check forces and parameters, and return both with a row for each load.
 
-    Parameters of shape (n_parameters,) belong to all loads.
+    Parameters of shape (n_parameters,) belong to all loads. In a scene with a tool, displacements
+    replace the forces, as `ObservedDisplacements` or in `ParametricForces`.
 
     Raises
     ------
@@ -173,8 +174,11 @@ def checked_parametric(
         As `checked_forces`; also if the scene has no sampled parameters, or the parameters are
         missing, have another shape, or lie outside the values for which they are defined.
     """
+    nodes = scene.observed_nodes
     if isinstance(forces, ParametricForces):
         parameters, forces = forces.parameters, forces.values
+        if nodes is not None:
+            forces = ObservedDisplacements(forces, nodes)
     names = scene.parameter_names
     if not names:
         raise InvalidInputError(
@@ -182,7 +186,10 @@ def checked_parametric(
         )
     if parameters is None:
         raise InvalidInputError(missing_parameters(scene))
-    values = checked_forces(scene, forces)
+    if nodes is not None and isinstance(forces, ObservedDisplacements):
+        values = _checked_displacements(scene.mesh.n_nodes, nodes, forces).values
+    else:
+        values = checked_forces(scene, forces)
     try:
         array = np.asarray(parameters)
     except (ValueError, TypeError) as error:

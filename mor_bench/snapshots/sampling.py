@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from mor_bench.errors import SpecError
-from mor_bench.scene import contact_surface
 from mor_bench.scene.acting import Acting
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.patch_loads import PatchLoads
@@ -122,7 +121,12 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
 def _drawn(scene: Scene, numbers: NDArray[np.int64]) -> PatchLoads:
     """Return some loads of a plan, each as a whole."""
     whole, sampled = _n_loads(scene), scene.generated.parameters
-    parts = [_drawn_from(acting, numbers, whole, sampled) for acting in scene.acting]
+    if scene.contact:
+        return _instrument_motions(scene.contact, scene.contact_surface.axis, numbers, sampled)
+    parts = [  # the parameters are drawn with the first table
+        _drawn_from(acting, numbers, whole, None if number else sampled)
+        for number, acting in enumerate(scene.acting)
+    ]
     if len(parts) == 1:
         return parts[0]
     n_patches = [len(acting.nodes) for acting in scene.acting]
@@ -130,6 +134,7 @@ def _drawn(scene: Scene, numbers: NDArray[np.int64]) -> PatchLoads:
     return PatchLoads(
         np.hstack([part.patches + first for part, first in zip(parts, firsts, strict=True)]),
         np.concatenate([part.vectors for part in parts], axis=1),
+        parts[0].parameters,
     )
 
 
@@ -143,8 +148,7 @@ def _drawn_from(
     loads = acting.plan
     if isinstance(loads, Pressure):
         return _pressures(loads, numbers, sampled)
-    if isinstance(loads, Contact):
-        return _instrument_motions(loads, numbers)
+    assert not isinstance(loads, Contact)  # see `_drawn`
     chosen, k = _combinations(acting), loads.simultaneous
     if chosen is None:
         patches = np.stack([_apart(acting, int(i)) for i in numbers])
@@ -197,12 +201,7 @@ def _pressures(
 ) -> PatchLoads:
     """Return pressures, as the forces -p e_i on three patches of each region."""
     d = len(loads.regions)
-    if loads.sampling == "random":
-        parameters = _random_parameters(loads.seed, sampled, numbers)
-        unit = _in_unit_cube(loads, numbers, d)
-    else:
-        unit = _in_unit_cube(loads, numbers, d + _n_parameters(sampled))
-        unit, parameters = unit[:, :d], _parameters(sampled, unit[:, d:])
+    unit, parameters = _with_parameters(loads, numbers, d, sampled)
     low, high = loads.magnitude
     pressures = low + (high - low) * unit
     vectors = -pressures[:, :, None, None] * np.eye(3)
@@ -210,10 +209,14 @@ def _pressures(
     return PatchLoads(patches, vectors.reshape(len(numbers), 3 * d, 3), parameters)
 
 
-def _instrument_motions(loads: Contact, numbers: NDArray[np.int64]) -> PatchLoads:
+def _instrument_motions(
+    loads: Contact,
+    axis: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    sampled: SampledParameters | None,
+) -> PatchLoads:
     """Return displacements of an instrument, in directions uniform on a cap of the sphere."""
-    drawn = _in_unit_cube(loads, numbers, 3)
-    axis = contact_surface.unit(loads.direction)
+    drawn, parameters = _with_parameters(loads, numbers, 3, sampled)
     first, second = (found[0, 0] for found in _tangents(axis[None, None]))
     height = 1.0 - drawn[:, 0] * (1.0 - np.cos(np.deg2rad(loads.spread_deg)))
     radius, angle = np.sqrt(np.maximum(1.0 - height**2, 0.0)), 2 * np.pi * drawn[:, 1]
@@ -221,17 +224,23 @@ def _instrument_motions(loads: Contact, numbers: NDArray[np.int64]) -> PatchLoad
     low, high = loads.magnitude
     size = low + (high - low) * drawn[:, 2]
     vectors = size[:, None] * (height[:, None] * axis + radius[:, None] * around)
-    return PatchLoads(np.zeros((len(numbers), 1), dtype=np.int64), vectors[:, None])
+    return PatchLoads(np.zeros((len(numbers), 1), dtype=np.int64), vectors[:, None], parameters)
 
 
-def _in_unit_cube(
-    loads: Pressure | Contact, numbers: NDArray[np.int64], d: int
-) -> NDArray[np.float64]:
-    """Return the coordinates (n, d) of samples that all act on the same regions."""
+def _with_parameters(
+    loads: Pressure | Contact,
+    numbers: NDArray[np.int64],
+    d: int,
+    sampled: SampledParameters | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return coordinates (n, d) in the unit cube, and sampled parameters (n, n_parameters)."""
     if loads.sampling == "random":
         drawn = [np.random.default_rng([loads.seed, int(i)]).uniform(size=d) for i in numbers]
-        return np.reshape(drawn, (len(numbers), d))
-    return design(loads.sampling, (loads.seed,), loads.samples, d)[numbers]
+        own = _random_parameters(loads.seed, sampled, numbers)
+        return np.reshape(drawn, (len(numbers), d)), own
+    n = d + _n_parameters(sampled)
+    unit = design(loads.sampling, (loads.seed,), loads.samples, n)[numbers]
+    return unit[:, :d], _parameters(sampled, unit[:, d:])
 
 
 def _combinations(acting: Acting) -> NDArray[np.int64] | None:

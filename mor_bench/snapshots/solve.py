@@ -17,8 +17,9 @@ from threadpoolctl import threadpool_limits
 from mor_bench.compile_clock import compile_clock
 from mor_bench.errors import InvertedElementError, SolverError, WorkerError
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.moved_bodies import generator_of
 from mor_bench.mechanics.newton import Solution
-from mor_bench.mechanics.parametric import Generator, OneBody, generator_of
+from mor_bench.mechanics.parametric import Generator, OneBody
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.load_paths import solve_paths
 from mor_bench.snapshots.patch_loads import PatchLoads

@@ -71,6 +71,7 @@ from mor_bench.specs.sampled_parameters import (
 )
 from mor_bench.specs.source_file import RECORDED, SourceFile
 from mor_bench.specs.spec_files import (
+    as_spec,
     is_method_file,
     load_dataset_spec,
     load_generated_spec,
@@ -135,6 +136,7 @@ __all__ = [
     "VoxelsGeometry",
     "YeohMaterial",
     "all_configurations",
+    "as_spec",
     "check_method",
     "check_parameters",
     "find_suite",

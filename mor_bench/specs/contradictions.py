@@ -8,12 +8,14 @@ from typing import Any
 from pydantic_core import PydanticCustomError
 
 from mor_bench.specs.loads_spec import (
+    AnyLoads,
     Contact,
     LineLoads,
     Motion,
     PointLoads,
     Pressure,
     Several,
+    tables_of,
 )
 from mor_bench.specs.sampled_parameters import wrong_parameters
 
@@ -73,9 +75,6 @@ def _of_parameters(tables: Tables) -> Iterator[str]:
     if "material" in tables:
         yield from wrong_parameters(parameters, tables["material"])
     others = {
-        "`loads.kind` is 'displacement'": isinstance(loads, Motion),
-        "`loads.kind` is 'contact'": isinstance(loads, Contact),
-        "several tables `[[loads]]` are given": isinstance(loads, Several),
         "`loads.steps` is above 1": loads is not None and loads.steps > 1,
         "`supports.direction` is given": _oblique(tables),
         "`observed` is given": tables.get("observed") is not None,
@@ -85,13 +84,20 @@ def _of_parameters(tables: Tables) -> Iterator[str]:
     for where in (other for other, present in others.items() if present):
         yield f"`parameters` must be absent where {where}"
     fixed_shape = {
-        "the loads are pressures": isinstance(loads, Pressure),
-        "the loads act on points or lines": isinstance(loads, PointLoads | LineLoads),
+        "an instrument presses": isinstance(loads, Contact),
+        "the loads are pressures": _has(loads, Pressure),
+        "the loads act on points or lines": _has(loads, PointLoads, LineLoads),
         "`springs` are given": bool(tables.get("springs")),
+        "`constant_pressures` are given": bool(tables.get("constant_pressures")),
     }
     for where in (other for other, present in fixed_shape.items() if present):
         if parameters.scale is not None:
             yield f"`parameters.scale` must be absent where {where}"
+
+
+def _has(loads: AnyLoads | None, *kinds: type) -> bool:
+    """Return whether one table of loads is of some kinds."""
+    return loads is not None and any(isinstance(table, kinds) for table in tables_of(loads))
 
 
 def _oblique(tables: Tables) -> bool:

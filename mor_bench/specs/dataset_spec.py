@@ -28,7 +28,7 @@ from mor_bench.specs.region_spec import Outputs, Region
 from mor_bench.specs.sampled_parameters import SampledParameters
 from mor_bench.specs.source_file import File, without_paths
 from mor_bench.specs.split_spec import ExtraTests, ImportedSplit, Split
-from mor_bench.specs.support_spec import Gravity, Spring, Support
+from mor_bench.specs.support_spec import ConstantPressure, Gravity, Spring, Support
 
 MAX_NODES = 1_000_000
 """Largest number of nodes of the grid to which samples are interpolated."""
@@ -131,6 +131,8 @@ class DatasetSpec(CommonDatasetSpec):
         Foundations, none by default.
     gravity : Gravity, optional
         A constant pre-load: displacements are measured from the rest state under it.
+    constant_pressures : tuple of ConstantPressure
+        Pressures that are part of the pre-load, none by default.
     loads : Loads, PointLoads, LineLoads, Motion, Pressure, Contact or Several, optional
         Sampled forces, displacements of a tool, pressures, motions of an instrument, or several of
         them together. Without it the scene can be solved for given forces, but no samples can be
@@ -148,6 +150,9 @@ class DatasetSpec(CommonDatasetSpec):
         tuple[Spring, ...], Field(strict=False, exclude_if=lambda value: not value)
     ] = ()
     gravity: Gravity | None = None
+    constant_pressures: Annotated[
+        tuple[ConstantPressure, ...], Field(strict=False, exclude_if=lambda value: not value)
+    ] = ()
     loads: LoadPlan | None = None
     parameters: SampledParameters | None = Field(
         default=None, exclude_if=lambda value: value is None
@@ -194,6 +199,11 @@ class DatasetSpec(CommonDatasetSpec):
         return self.loads if isinstance(self.loads, Motion) else None
 
     @property
+    def is_preloaded(self) -> bool:
+        """Whether gravity or constant pressures act before and during every load."""
+        return self.gravity is not None or bool(self.constant_pressures)
+
+    @property
     def load_plan(self) -> AnyLoads:
         """The table `[loads]`, from which samples are drawn; `SpecError` if there is none."""
         if self.loads is None:
@@ -212,6 +222,7 @@ class DatasetSpec(CommonDatasetSpec):
                 "supports",
                 "springs",
                 "gravity",
+                "constant_pressures",
                 "loads",
                 "parameters",
             },

@@ -242,8 +242,9 @@ class Contact(StrictModel):
         What the instrument may touch: the facets with all corners in it. All others pass through.
     instrument : SphereInstrument or PlaneInstrument
         It must not penetrate the region at rest.
-    direction : three floats
-        Axis of the directions in which it moves; the length is ignored.
+    direction : three floats, optional
+        Axis of the directions in which it moves; the length is ignored. Default: against the
+        outward normal of the region at the point nearest to the instrument.
     spread_deg : float
         Largest angle between a motion and the axis. The directions are uniform on the sphere
         within it. Default: 0, always along the axis.
@@ -267,7 +268,7 @@ class Contact(StrictModel):
     region: Region
     kind: Literal["contact"]
     instrument: Instrument
-    direction: Direction
+    direction: Annotated[Direction | None, Field(exclude_if=lambda value: value is None)] = None
     spread_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
     magnitude_m: Magnitude
     samples: Count
@@ -344,9 +345,7 @@ class Several(StrictModel):
     @model_validator(mode="after")
     def _together(self) -> Self:
         kinds = [
-            "follower pressure"
-            if isinstance(table, Pressure) and table.follower
-            else f"{table.kind}"
+            "follower pressure" if getattr(table, "follower", False) else str(table.kind)
             for table in self.tables
         ]
         for alone in ("displacement", "contact", "follower pressure"):
@@ -355,7 +354,7 @@ class Several(StrictModel):
                 other = kinds[1 if place == 0 else 0]
                 raise ValueError(
                     f"`loads` cannot combine the kinds {alone!r} and {other!r}: only dead loads "
-                    "act together"
+                    "act together; pressures that do not vary belong in `constant_pressures`"
                 )
         for name in ("samples", "steps"):
             values = [getattr(table, name) for table in self.tables]

@@ -49,6 +49,13 @@ def load_dataset_spec(
     return _validated_dataset(content, str(path), path.parent)
 
 
+def as_spec(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> AnyDatasetSpec:
+    """Return the spec of a dataset, given by name, path, dict or spec."""
+    if isinstance(source, DatasetSpec | ImportedDatasetSpec):
+        return source
+    return load_dataset_spec(source)
+
+
 def _dataset_file(source: str | Path, suite: Path | None) -> Path:
     try:
         path = find_file("datasets", source, suite)

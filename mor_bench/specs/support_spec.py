@@ -1,4 +1,4 @@
-"""Tables `[[supports]]`, `[[springs]]` and `[gravity]` of a dataset file."""
+"""Supports, springs and constant loads of a dataset file."""
 
 from __future__ import annotations
 
@@ -101,3 +101,28 @@ class Gravity(StrictModel):
         0.0,
         -9.81,
     )
+
+
+def _not_zero(value: float) -> float:
+    if value == 0:
+        raise ValueError("a pressure of 0 has no effect; remove the table")
+    return value
+
+
+class ConstantPressure(StrictModel):
+    """A uniform pressure on a region of the surface that acts before and during every load.
+
+    Attributes
+    ----------
+    region : Region
+        The facets with all corners in it are pressed.
+    pressure_pa : float
+        It pushes into the body; a negative one pulls.
+    follower : bool
+        Whether it acts on the deformed surface, along its normals. If not, it is a dead load along
+        the normals of the undeformed body. Default: false.
+    """
+
+    region: Region
+    pressure_pa: Annotated[Finite, in_range(-1e15, 1e15, "Pa"), AfterValidator(_not_zero)]
+    follower: bool = False

@@ -15,6 +15,7 @@ from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.compliance import Compliance, project
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
+from mor_bench.mechanics.moved_bodies import MovedResponse, parametric_response
 from mor_bench.mechanics.observed import LinearResponse, linear_response
 from mor_bench.mechanics.parametric import Bodies, ParametricResponse
 from mor_bench.model_arrays import take_array
@@ -114,7 +115,7 @@ class CoordinateRegression(Surrogate, ABC):
     axes_: Array
     modes_: Array
     response_: LinearResponse
-    responses_: ParametricResponse
+    responses_: ParametricResponse | MovedResponse
     ends_: Array
     """(2, n_varied): lowest and highest training value of each parameter that g depends on."""
 
@@ -263,7 +264,7 @@ class CoordinateRegression(Surrogate, ABC):
 
     def _respond_to(self, scene: Scene) -> None:
         if scene.parameter_names:
-            self.responses_ = ParametricResponse(scene)
+            self.responses_ = parametric_response(scene)
         else:
             self.response_ = linear_response(scene)
 

@@ -12,9 +12,9 @@ from pydantic import Field
 
 from mor_bench.errors import SolverError
 from mor_bench.mechanics.model import missing_library, unknown_equations
+from mor_bench.mechanics.moved_bodies import parametric_model
 from mor_bench.mechanics.newton import NewtonOptions, Solution
 from mor_bench.mechanics.observed import forward_model
-from mor_bench.mechanics.parametric import ParametricModel
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.specs import SolverName
@@ -49,7 +49,7 @@ class FullFEM(Surrogate):
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
         if scene.parameter_names:
-            self.bodies_ = ParametricModel(scene, self.solver)
+            self.bodies_ = parametric_model(scene, self.solver)
             self.bodies_.prepare()
         else:
             self.model_ = forward_model(scene, self.solver)

@@ -168,7 +168,7 @@ class CubatureSurrogate(Surrogate):
     def _problem_of(self, parameters: Array) -> CubatureProblem:
         """Return the problem of a body, (n_parameters,)."""
         scene = self.bodies_.at(parameters)
-        if self.scene_.springs or scene.generated.gravity is not None:
+        if self.scene_.springs or scene.generated.is_preloaded:
             return self._problem(scene)
         body = replace(body_of(scene, self.cells_), positions=self.positions_)
         points = self.problem_.points.scaled(body, scale_of(self.scene_, parameters))

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.mechanics.model import unknown_equations
+from mor_bench.mechanics.moved_bodies import parametric_response
 from mor_bench.mechanics.observed import linear_response
-from mor_bench.mechanics.parametric import ParametricResponse
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
@@ -33,7 +33,7 @@ class LinearFEM(Surrogate):
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
         if scene.parameter_names:
-            self.responses_ = ParametricResponse(scene)
+            self.responses_ = parametric_response(scene)
         else:
             self.compliance_ = linear_response(scene)
 

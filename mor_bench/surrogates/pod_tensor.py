@@ -63,7 +63,7 @@ class TensorPOD(Surrogate):
     def supports(self, scene: Scene) -> str | None:
         if others := [n for n in scene.parameter_names if n not in ("young_pa", "poisson")]:
             return f"its polynomial is exact in λ and μ only; the scene samples {', '.join(others)}"
-        if scene.parameter_names and scene.generated.gravity is not None:
+        if scene.parameter_names and scene.generated.is_preloaded:
             return "its polynomial about the rest state is that of one material only"
         if scene.material is not None and not has_polynomial(scene):
             law = scene.generated.material.law

@@ -11,12 +11,17 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 import mor_bench
+from mor_bench.counting import counted
 from mor_bench.errors import InvalidInputError, SolverError, UnsupportedSceneError
 from mor_bench.hard_cases.setups import material_table
 from mor_bench.mechanics.contact import ContactModel, penetrations
+from mor_bench.mechanics.contact_acceleration import PressedInverse, TouchedDofs
+from mor_bench.mechanics.contact_points import ContactPoints
 from mor_bench.mechanics.linear_contact import LinearContact
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.mechanics.observed import ToolForces
+from mor_bench.mechanics.moved_bodies import ToolForces
+from mor_bench.mechanics.newton import Solution
+from mor_bench.mechanics.problem import Attempt
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.given import given_of
 from mor_bench.snapshots.solve import pack
@@ -341,3 +346,41 @@ def test_an_instrument_presses_the_smooth_surface_in_a_mesh_of_voxels() -> None:
     force = ToolForces(scene)(u[None])[0].sum(axis=0)
     np.testing.assert_allclose(force, -model.reaction(u), atol=1e-9 * float(np.abs(force).max()))
     assert model.reaction(u)[2] > 0.01
+
+
+def test_the_pressed_inverse_is_that_of_the_stiffness_at_rest_with_the_contact() -> None:
+    model, u = pressed(block(), [0.0, 0.0, -0.1])
+    touched, touch = TouchedDofs(model, ContactPoints(model.scene)), model.touch(u)
+    inverse = PressedInverse(model.turned_rest.at(None), touched, touch)
+    used, push = touched.contact.dense(touch, curved=False)
+    force = np.random.default_rng(0).normal(size=model.n_unknowns)
+    found = inverse.solve(force)
+    on_contact = np.zeros(touched.n)
+    on_contact[used] = push @ touched.at(found)[used]
+    stiffness = model.assembler.pattern.symmetric(model.assembler.force_and_tangent(0.0 * u)[1])
+    left = stiffness @ found + touched.spread(on_contact) - force
+    assert np.linalg.norm(left) < 1e-3 * np.linalg.norm(force)
+
+
+@pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron"])
+def test_the_accelerated_iteration_finds_the_states_of_the_descent(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order = {} if kind == "hexahedron" else {"order": 2}
+    scene, generator = block(discretisation={"element": kind, **order}), np.random.default_rng(1)
+    motions = generator.uniform([-0.2, -0.2, -0.2], [0.2, 0.2, 0.0], size=(6, 3))
+    rows = np.array([given(scene, m.tolist()).ravel()[scene.free_dofs] for m in motions])
+    model = ContactModel(scene)
+    with counted() as fast:
+        found = model.solve_many(rows)
+    missed = Attempt(np.zeros(0), 1.0, 0, converged=False)
+    monkeypatch.setattr(ContactModel, "quickly", lambda *_: missed)
+    with counted() as slow:
+        expected = model.solve_many(rows)
+    for one, other in zip(found, expected, strict=True):
+        assert isinstance(one, Solution)
+        assert isinstance(other, Solution)
+        size = np.abs(other.displacement).max()
+        assert np.abs(one.displacement - other.displacement).max() < 1e-6 * size
+    assert fast.multiply_adds > 0
+    assert fast.element_evaluations < slow.element_evaluations

@@ -258,7 +258,7 @@ class Cubic:
     first linearisations hands the solve over to the safeguarded pass.
     """
 
-    n_unknowns, extent, accelerator = 1, 1e30, None
+    n_unknowns, extent, linear_at_rest, accelerator = 1, 1e30, True, None
 
     def __init__(self, hopeless: int) -> None:
         self._hopeless = hopeless
@@ -314,7 +314,7 @@ def test_a_prediction_that_moves_a_clamp_has_an_error_at_least_as_large() -> Non
 class Mirrored(Cubic):
     """The same with inverted cells at every state."""
 
-    extent = 1.0
+    extent, linear_at_rest = 1.0, True
 
     def force(self, q: Array) -> State:
         return replace(super().force(q), min_det_f=-1.0)

@@ -153,6 +153,12 @@ def test_other_forces_and_other_models_are_refused() -> None:
         mor_bench.load_method("fem").fit(scene).predict(np.ones((scene.mesh.n_nodes, 3)))
     with pytest.raises(SpecError, match=r"`loads\.follower` must be false"):
         load_scene({**_liver(), "loads": {**FOLLOWING, "regions": ["surface"]}})
+    seen = pressed(
+        supports=CLAMPED,
+        loads={**FOLLOWING, "regions": ["z-max"]},
+        observed={"region": "x-max"},
+    )
+    assert "follow the surface" in str(mor_bench.load_method("fem").supports(seen))
     with pytest.raises(UnsupportedSceneError, match="no pressure follows"):
         PressedModel(pressed())
 

@@ -14,8 +14,9 @@ from mor_bench.hard_cases.setups import material_table
 from mor_bench.measure.discretisation_error import refine
 from mor_bench.measure.reaction_errors import ReactionErrors
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.moved_bodies import ToolForces
 from mor_bench.mechanics.newton import NewtonOptions, Solution
-from mor_bench.mechanics.observed import ObservedModel, ToolForces
+from mor_bench.mechanics.observed import ObservedModel
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.snapshots.test_sets import spec_of_set
