@@ -207,9 +207,9 @@ def accelerated_contact(
             break
         before = size
         turning = float(np.abs(correction).max()) > TURNING * float(np.abs(q).max())
-        q = q + memory.advance(q, correction, residual)
+        q = q + memory.advance(q, correction)
     else:
         return Attempt(q, min_det, ACCELERATED_ITERATIONS, converged=False)
     ends = (touched.contact.normals(touched.at(u), model.motion) for u in (start, q))
     passed = np.prod(list(ends), axis=0).sum(axis=1) < 0  # also where it does not touch any more
-    return Attempt(q, min_det, iteration, converged=memory.convex and not passed.any())
+    return Attempt(q, min_det, iteration, converged=not passed.any())

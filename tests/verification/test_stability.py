@@ -252,7 +252,7 @@ def test_a_disturbance_is_not_removed_along_earlier_steps_of_negative_curvature(
     for seed in range(40):
         rng = np.random.default_rng(seed)
         stiffness = np.linspace(0.8, 1.2, n)
-        problem: Any = SimpleNamespace(n_unknowns=n, extent=1.0)
+        problem: Any = SimpleNamespace(n_unknowns=n, extent=1.0, linear_at_rest=False)
         problem.force = lambda q, k=stiffness: SimpleNamespace(force=k * q, min_det_f=1.0)
         load, inverse = 0.1 * rng.normal(size=n), Identity(n, 1000 + seed)
         load[0] *= 10.0
