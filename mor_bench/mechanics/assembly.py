@@ -214,6 +214,8 @@ class Assembler:
             if frames is not None:
                 rest[self._own] = frames.to_local(body.rest.ravel()).reshape(-1, 3)
             self._rest = self._total(rest[:-1]), self.force(rest[:-1]).force
+            if self._followers is not None:
+                self._followers.begin_at(self._rest[0][: self._n_summed])
 
     def _total(self, u: Array) -> Array:
         """Return total displacements along x, y and z, as the kernels read them."""
@@ -302,8 +304,7 @@ class Assembler:
         if self._springs is not None:
             energy += self._springs.add(moved, force, values)
         if self._followers is not None:
-            rest = np.zeros(len(moved)) if self._rest is None else self._rest[0][: len(moved)]
-            energy += self._followers.add(moved, rest, force, values)
+            energy += self._followers.add(moved, force, values)
         return energy, min_det_f
 
     @property

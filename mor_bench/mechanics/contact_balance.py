@@ -73,7 +73,7 @@ class Balance:
         the change of the forces since the begin.
         """
         touch, first = self._contact.touch(u, motion), forces
-        begin, work = u - self._flexibility.apply(forces), 0.0
+        begin = u - self._flexibility.apply(forces)
         for _ in range(self._most_steps):
             wanted = self._contact.force(touch)
             excess = wanted - forces
@@ -85,14 +85,14 @@ class Balance:
                 step = self._flexibility.apply(change)
                 if (slope := float(excess @ step)) > 0:
                     break
-            work = 0.5 * float(forces @ (u - begin)) + touch.energy_j
+            before = 0.5 * float(forces @ (u - begin)) + touch.energy_j
             for halving in range(MAX_HALVINGS):
                 length = 0.5**halving
                 other, there = forces + length * change, u + length * step
                 touch = self._contact.touch(there, motion)
                 left = float((self._contact.force(touch) - other) @ step)
                 energy = 0.5 * float(other @ (there - begin)) + touch.energy_j
-                if energy <= work or abs(left) <= slope:
+                if energy <= before or abs(left) <= slope:
                     break
             forces, u = other, there
             whole = float(np.linalg.norm(forces - first))

@@ -79,9 +79,9 @@ class LinearContact:
         reached, forces = 0.0, np.zeros(len(self._dofs))
         while reached < 1.0:
             place = 1.0 if reached + 1.001 * step > 1.0 else reached + step
-            before = self._contact.normals(self._flexibility @ forces, reached * motion)
             u = self._flexibility @ forces
             count(multiply_adds=self._flexibility.size)
+            before = self._contact.normals(u, reached * motion)
             found = self._balance.settle(u, forces, place * motion)
             if found is not None and not self._passed(found, place * motion, before):
                 reached, forces = place, found

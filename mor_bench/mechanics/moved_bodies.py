@@ -6,9 +6,8 @@ it scales all forces, as the default stiffness of a contact does.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Generic
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,10 @@ from mor_bench.mechanics.observed import (
     linear_response,
 )
 from mor_bench.mechanics.parametric import (
-    MAX_KEPT,
     Bodies,
     Generator,
+    LastUsed,
+    Made,
     OneBody,
     ParametricModel,
     ParametricResponse,
@@ -35,7 +35,6 @@ from mor_bench.scene.scene import Scene
 from mor_bench.specs import SolverName
 
 Array = NDArray[np.float64]
-Made = TypeVar("Made")
 
 
 class _PerBody(Generic[Made]):
@@ -44,18 +43,12 @@ class _PerBody(Generic[Made]):
     def __init__(self, scene: Scene, make: Callable[[Scene], Made]) -> None:
         _ = scene.observed_nodes  # those of all bodies
         self.bodies, self._make = Bodies(scene), make
-        self._kept: OrderedDict[bytes, Made] = OrderedDict()
+        self._kept: LastUsed[Made] = LastUsed()
 
     def of(self, parameters: Array) -> Made:
         """Return it for a body, (n_parameters,), or for one with the same displacements."""
         shared = self.bodies.shared(parameters)[0]
-        key = shared.tobytes()
-        if key not in self._kept:
-            self._kept[key] = self._make(self.bodies.at(shared))
-            if len(self._kept) > MAX_KEPT:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        return self._kept.of(shared, lambda: self._make(self.bodies.at(shared)))
 
 
 class MovedBodies:

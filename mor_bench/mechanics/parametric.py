@@ -11,8 +11,9 @@ Poisson's ratio and the shape vary together on a body near incompressibility.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 from copy import copy
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ from mor_bench.scene.scene_at import reference_parameters, scale_of, scene_at
 from mor_bench.specs import SolverName
 
 Array = NDArray[np.float64]
+
+Made = TypeVar("Made")
 
 MAX_KEPT = 8
 """Number of bodies whose models are kept for further loads."""
@@ -73,6 +76,23 @@ class Bodies:
         return scene_at(self.scene, parameters)
 
 
+class LastUsed(Generic[Made]):
+    """What was made for the bodies that were used last, by their parameters."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[bytes, Made] = OrderedDict()
+
+    def of(self, parameters: Array, make: Callable[[], Made]) -> Made:
+        """Return what belongs to parameters (n_parameters,); make it if it is not kept."""
+        key = parameters.tobytes()
+        if key not in self._kept:
+            self._kept[key] = make()
+            if len(self._kept) > MAX_KEPT:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+
 class ParametricModel:
     """Full-order models of the bodies of a parametric scene.
 
@@ -86,7 +106,7 @@ class ParametricModel:
     def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
         self.scene, self.bodies = scene, Bodies(scene)
         self.reference = FullOrderModel(scene, solver)
-        self._kept: OrderedDict[bytes, FullOrderModel] = OrderedDict()
+        self._kept: LastUsed[FullOrderModel] = LastUsed()
 
     def prepare(self) -> None:
         """Compute the factor that all solves share."""
@@ -105,21 +125,18 @@ class ParametricModel:
         """Return the model of a body, (n_parameters,); the last ones are kept."""
         if self.bodies.is_reference(parameters):
             return self.reference
-        key = parameters.tobytes()
-        if key not in self._kept:
-            found = copy(self.reference)
-            found.scene = self.bodies.at(parameters)
-            body = body_of(found.scene)
-            found.assembler = self._assembler(body, parameters)
-            found.extent = found.assembler.extent_m
-            found.rest = None if body.rest is None else body.rest.ravel()[found.scene.free_dofs]
-            for name in ("rest_tangent", "rest_factor"):  # the rotated factor stays
-                vars(found).pop(name, None)
-            self._kept[key] = found
-            if len(self._kept) > MAX_KEPT:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        return self._kept.of(parameters, lambda: self._made(parameters))
+
+    def _made(self, parameters: Array) -> FullOrderModel:
+        found = copy(self.reference)
+        found.scene = self.bodies.at(parameters)
+        body = body_of(found.scene)
+        found.assembler = self._assembler(body, parameters)
+        found.extent = found.assembler.extent_m
+        found.rest = None if body.rest is None else body.rest.ravel()[found.scene.free_dofs]
+        for name in ("rest_tangent", "rest_factor"):  # the rotated factor stays
+            vars(found).pop(name, None)
+        return found
 
     def solve_many(
         self,

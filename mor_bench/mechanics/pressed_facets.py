@@ -152,14 +152,19 @@ class ConstantFollowers:
         self._facets = PressedFacets(points, [each.facets for each in held], dof_of_node, pattern)
         self._pressures = np.array([each.pressure_pa for each in held])
         self._n = pattern.n
+        self.begin_at(np.zeros(pattern.n))
 
-    def add(self, u: Array, rest: Array, force: Array, values: Array) -> float:
+    def begin_at(self, rest: Array) -> None:
+        """Count the work from a rest state with displacements (n,), m, and not from zero."""
+        self._rest, self._begin = rest, self._facets.force(rest, self._pressures)
+
+    def add(self, u: Array, force: Array, values: Array) -> float:
         """Add to the internal force and, where ``values`` is not empty, to the tangent.
 
         Parameters
         ----------
-        u, rest : (n,) float64
-            Displacements, m, and those of the rest state.
+        u : (n,) float64
+            Displacements, m.
         force : (n or more,) float64
         values : (n_values or more,) float64
 
@@ -169,15 +174,15 @@ class ConstantFollowers:
             Minus the work, J, on the straight way from the rest state.
         """
         # The force is quadratic on this way, so that Simpson's rule is exact.
-        begin, middle, end = (
-            self._facets.force(rest + part * (u - rest), self._pressures)
-            for part in (0.0, 0.5, 1.0)
+        way = u - self._rest
+        middle, end = (
+            self._facets.force(self._rest + part * way, self._pressures) for part in (0.5, 1.0)
         )
         force[: self._n] -= end
         if len(values):
             found = self._facets.stiffness(u, self._pressures)
             values[: len(found)] += found
-        return -float((begin + 4.0 * middle + end) @ (u - rest)) / 6.0
+        return -float((self._begin + 4.0 * middle + end) @ way) / 6.0
 
     def skew_stiffness(self, u: Array) -> sp.csr_array:
         """Return the skew part of the tangent, (n, n), N/m, at displacements (n,), m."""

@@ -67,7 +67,7 @@ class Scene:
     constant_pressures : tuple of HeldPressure
         Pressures that are part of the pre-load.
     memo : dict of str to float64
-        Arrays that are computed once for a scene, such as its rest state under gravity.
+        Arrays that are computed once for a scene, such as its rest state.
 
     Examples
     --------
