@@ -40,6 +40,12 @@ SEED = 0
 EPS = float(np.finfo(np.float64).eps)
 SOLVED = 1e-8
 """Relative error of displacements that the full-order model solved for, by its default."""
+DETERMINED = 10 * SOLVED
+"""Least relative singular value of a mode that is more than the error of the solver.
+
+Below, that error turns the mode by more than a tenth. In a nearly incompressible body the cubature
+then matches mainly false changes of volume.
+"""
 
 
 @dataclass(frozen=True)
@@ -122,11 +128,11 @@ def accurate_modes(displacements: NDArray[np.float64], n_modes: int) -> NDArray[
     """
     basis = pod(displacements, n_modes)
     sizes = basis.singular_values[: basis.modes.shape[1]]
-    kept = int((sizes > SOLVED * sizes[0]).sum())
+    kept = int((sizes > DETERMINED * sizes[0]).sum())
     if kept < len(sizes):
         warnings.warn(
             f"{n_modes} modes were requested, but the samples determine {kept}: the others hold "
-            f"less than {SOLVED:g} of the displacements, which is the error of the solver. "
+            f"less than {DETERMINED:g} of the displacements, too near to the error of the solver. "
             f"{kept} modes are used.",
             RankDeficientWarning,
             stacklevel=2,
