@@ -22,6 +22,7 @@ from tests.published.cost_tables import (
     probe_cost,
     scaling,
 )
+from tests.published.front_tables import fronts
 from tests.published.literature_table import literature
 from tests.published.network_size_tables import (
     full_sizes,
@@ -367,6 +368,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "choices-decided": choices_decided,
     "network-sizes": network_sizes,
     "network-size-law": network_size_law,
+    "fronts": fronts,
     "full-sizes": full_sizes,
     "paper-size": paper_size,
     "paper-size-latency": paper_size_latency,

@@ -1,0 +1,92 @@
+"""Compare methods as they were at an earlier commit with the same methods today, on one machine.
+
+    python -m tests.benchmarks.fronts 012668a --json fronts.json
+
+Each version runs its own `mor-bench run` on the same scenes and the same loads, with the default
+configurations of its methods. Test sets out of range are left out, because the earlier version does
+not know all of them. Networks are left out, because their errors depend on the length of the
+training. The regression has another name today, which says what it is told.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import typer
+
+from mor_bench.snapshots.store import write_atomically
+
+ROOT = Path(__file__).parents[2]
+SCENES = (
+    "beam-coarse",
+    "beam-coarse-3-forces",
+    "beam-fine",
+    "l-shape",
+    "liver-hex",
+    "liver-tet",
+    "beam-nearly-incompressible",
+    "beam-neo-hooke",
+)
+BEFORE = ("fem", "linear-fem", "pod", "hpod", "pca-regression", "sparse-polynomial", "pod-nn")
+NOW = ("fem", "linear-fem", "pod", "hpod", "pca-regression-linear", "sparse-polynomial", "pod-nn")
+
+TEST_SETS = re.compile(r"^\[tests\]\n(?:[^\[\n].*\n|\n)*", re.MULTILINE)
+ERRORS = ("rel_l2_median", "rel_l2_p95", "rel_l2_max")
+
+
+def rows_of(code: Path, methods: tuple[str, ...], limit: int, folder: Path) -> list[dict[str, Any]]:
+    """Run a version of the suite; return error and time of each configuration that ended."""
+    folder.mkdir()
+    scenes = []
+    for name in SCENES:
+        text = (ROOT / f"datasets/{name}.toml").read_text(encoding="utf-8")
+        (folder / f"{name}.toml").write_text(TEST_SETS.sub("", text), encoding="utf-8")
+        scenes.append(str(folder / f"{name}.toml"))
+    chosen = [text for name in methods for text in ("-m", name)]
+    command = [sys.executable, "-m", "mor_bench", "run", *scenes, *chosen]
+    command += ["--limit", str(limit), "--out", str(folder / "run"), "--cache", str(folder)]
+    subprocess.run(command, cwd=code, env={**os.environ, "PYTHONPATH": str(code)}, check=True)
+    results = json.loads((folder / "run/results.json").read_text(encoding="utf-8"))
+    return [
+        {
+            "dataset": row["dataset"],
+            "method": row["method"],
+            "label": row["label"],
+            "ms": row["latency_ms"]["median"],
+            **{name: row["error"][name] for name in ERRORS},
+        }
+        for row in results["rows"]
+        if row["status"] == "ok"
+    ]
+
+
+def main(
+    commit: Annotated[str, typer.Argument(help="The earlier commit.")],
+    limit: Annotated[int, typer.Option(help="Samples of each scene.")] = 400,
+    report: Annotated[
+        Path, typer.Option("--json", metavar="FILE", help="Write the rows here.")
+    ] = Path("fronts.json"),
+) -> None:
+    """Compare methods as they were at an earlier commit with the same methods today."""
+    found: dict[str, Any] = {"commit": commit, "limit": limit}
+    with TemporaryDirectory() as text:
+        folder = Path(text)
+        old = folder / "code"
+        subprocess.run(["git", "worktree", "add", "--detach", old, commit], cwd=ROOT, check=True)
+        try:
+            found["before"] = rows_of(old, BEFORE, limit, folder / "before")
+            found["now"] = rows_of(ROOT, NOW, limit, folder / "now")
+        finally:
+            subprocess.run(["git", "worktree", "remove", "--force", old], cwd=ROOT, check=True)
+    write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
+
+
+if __name__ == "__main__":
+    typer.run(main)

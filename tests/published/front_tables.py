@@ -1,0 +1,53 @@
+"""The table of methods of an earlier commit beside those of today."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mor_bench.report.number_format import DASH, number
+from tests.published.run_tables import markdown
+from tests.published.stored import content_of
+
+TARGETS = (0.1, 0.03, 0.01, 0.003)
+"""Errors to reach: 95th percentiles of the relative L2 error."""
+
+LIMITS_MS = (0.3, 1.0, 3.0)
+"""Times to stay within."""
+
+Rows = list[dict[str, Any]]
+
+
+def fronts(source: str) -> str:
+    """Show the fastest time for each error and the least error in each time, before and now."""
+    content = content_of(source)
+    body = []
+    for dataset in dict.fromkeys(row["dataset"] for row in content["now"]):
+        before, now = (
+            [row for row in content[code] if row["dataset"] == dataset]
+            for code in ("before", "now")
+        )
+        cells = [_change(_fastest(before, e), _fastest(now, e), "ms", 1.0) for e in TARGETS]
+        cells += [
+            _change(_best(before, ms), _best(now, ms), "rel_l2_p95", 100.0) for ms in LIMITS_MS
+        ]
+        body.append([dataset, *cells])
+    headings = ["scene", *(f"ms for {100 * error:g} %" for error in TARGETS)]
+    return markdown([*headings, *(f"% in {ms:g} ms" for ms in LIMITS_MS)], body)
+
+
+def _fastest(rows: Rows, error: float) -> dict[str, Any] | None:
+    able = [row for row in rows if row["rel_l2_p95"] <= error]
+    return min(able, key=lambda row: float(row["ms"]), default=None)
+
+
+def _best(rows: Rows, ms: float) -> dict[str, Any] | None:
+    able = [row for row in rows if row["ms"] <= ms]
+    return min(able, key=lambda row: float(row["rel_l2_p95"]), default=None)
+
+
+def _change(
+    before: dict[str, Any] | None, now: dict[str, Any] | None, name: str, scale: float
+) -> str:
+    """Return both values, and the method of today's."""
+    values = [DASH if row is None else number(scale * row[name]) for row in (before, now)]
+    return " → ".join(values) + ("" if now is None else f" `{now['method']}`")
