@@ -18,7 +18,6 @@ from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.scene import load_scene
 from mor_bench.scene.symmetry import mirrors
 from mor_bench.snapshots.dataset import Dataset, Snapshots
-from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.training_options import TrainingOptions
 from tests.irregular import irregular_box, irregular_samples
 
@@ -355,38 +354,6 @@ def test_an_interrupted_training_ends_with_the_same_bits(
     with pytest.raises(InvalidInputError, match="another training"):
         fit(data.train, options, **{**knobs, "seed": 1})
     assert_same_model(fit(data.train, options, **knobs), fit(data.train, **knobs))
-
-
-@pytest.mark.parametrize("cells", [(2, 6, 3), (6, 2, 2), (2, 2, 6)])
-def test_answers_do_not_depend_on_the_axis_along_which_a_mesh_is_long(
-    cells: tuple[int, int, int], data: Dataset, tmp_path: Path
-) -> None:
-    """The network sees the longest axis last, and a saved one has the order of the mesh."""
-    spec = data.scene.spec.model_dump(mode="json", exclude_none=True)
-    kept = {name: spec[name] for name in ("title", "source", "material", "supports")}
-    scene = load_scene({**kept, "geometry": {**spec["geometry"], "cells": cells}})
-    forces = np.random.default_rng(0).normal(size=(4, scene.mesh.n_nodes, 3))
-    free = forces.reshape(4, -1)[:, scene.free_dofs]
-    samples = Snapshots(scene, NodalLoads(forces, np.zeros((4, 1), np.int64)), free, np.ones(4))
-    method = fit(samples, iterations=1)
-    assert method.grid_.shape[2] == max(method.grid_.shape)
-    method.save(tmp_path / "umesh.safetensors")
-    loaded = load_fitted(tmp_path / "umesh.safetensors", type(method), scene)
-    np.testing.assert_array_equal(loaded.predict(forces), method.predict(forces))
-    network, grid = UNet(8, 1), padded_grid(grid_map(scene.mesh), 1)
-    network.load_state_dict(
-        {
-            name.removeprefix("network."): torch.from_numpy(values)
-            for name, values in method.arrays_.items()
-            if name.startswith("network.")
-        }
-    )
-    scaled = torch.from_numpy((forces / method.input_scale_).astype(np.float32))
-    with torch.inference_mode():
-        expected = grid.to_nodes(network(grid.to_grid(scaled))).numpy() * method.output_scale_
-    expected[:, scene.fixed_nodes] = 0.0
-    largest = np.abs(expected).max()
-    np.testing.assert_allclose(method.predict(forces), expected, rtol=0, atol=1e-5 * largest)
 
 
 def test_a_training_starts_from_a_network_of_another_scene(
