@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mor_bench.measure.error_bounds import ErrorBound as ErrorBound
     from mor_bench.measure.error_bounds import error_bound as error_bound
     from mor_bench.mechanics.reactions import reaction_forces as reaction_forces
+    from mor_bench.mechanics.reactions import tool_forces as tool_forces
     from mor_bench.mechanics.stresses import Stresses as Stresses
     from mor_bench.mechanics.stresses import stresses as stresses
     from mor_bench.method_loading import load_method as load_method
@@ -69,6 +70,7 @@ _HOMES = {
     "reaction_forces": "mor_bench.mechanics.reactions",
     "run": "mor_bench.report.notebook",
     "stresses": "mor_bench.mechanics.stresses",
+    "tool_forces": "mor_bench.mechanics.reactions",
 }
 
 

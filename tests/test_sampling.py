@@ -157,6 +157,7 @@ TOO_MANY = r"`n_patches` must be in \[1, \d+\], the number of points of the load
         ({"min_distance_m": None}, r"`min_distance_m` must be given with `simultaneous` > 1"),
         ({"samples": None, "samples_per_patch": 3}, r"with `simultaneous` > 1 `samples` must be"),
         ({"samples": None}, ONE_OF),
+        ({"samples": None, "min_distance_m": None}, ONE_OF + ".*; `min_distance_m` must be given"),
         ({"samples_per_patch": 3}, ONE_OF),
         ({"simultaneous": 9}, r"`loads.simultaneous` must be less than or equal to 8; got 9"),
         ({"simultaneous": 1}, r"must be given with `simultaneous` > 1 and only then"),

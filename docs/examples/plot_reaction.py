@@ -32,9 +32,9 @@ held[:, :, 2] = ways[:, None]
 for name in ("fem", "linear-fem"):
     method = mor_bench.load_method(name).fit(scene)
     u = method.predict(ObservedDisplacements(held, scene.observed_nodes))
-    forces = mor_bench.reaction_forces(scene, u, np.zeros_like(u))
-    plt.plot(1e3 * ways, -forces[:, :, 2].sum(axis=1), "o-", label=name)
+    forces = mor_bench.tool_forces(scene, u)
+    plt.plot(1e3 * ways, forces[:, :, 2].sum(axis=1), "o-", label=name)
 plt.xlabel("way of the tool (mm)")
-plt.ylabel("lateral force at the support (N)")
+plt.ylabel("lateral force of the tool (N)")
 plt.legend(frameon=False)
 plt.show()

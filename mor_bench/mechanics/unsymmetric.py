@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse import linalg as sp_linalg
@@ -18,6 +19,8 @@ SYMMETRIC = 1e-12
 """Largest entry of a skew part, relative to that of the symmetric part, that is round-off."""
 EIGENVALUES = 6
 """Number of eigenvalues that decide on stability."""
+DENSE_UP_TO = 30
+"""Largest number of unknowns for which a dense solver finds all eigenvalues."""
 EIGENVALUE_TOLERANCE = 1e-6
 REAL = 1e-2
 """Imaginary part of an eigenvalue, relative to its modulus, up to which it counts as real."""
@@ -72,24 +75,34 @@ def is_stable(tangent: sp.csr_array, rest: sp.csr_array) -> bool:
 
     The Cayley transform θ = (μ - 1) / (μ + 1) maps exactly the μ with a real part > 0 into the unit
     circle. Arnoldi's method finds the θ of largest modulus (Meerbergen, Spence and Roose, BIT 34,
-    1994). If all of them are outside, there may be more, and the state counts as unstable.
+    1994). If all of them are outside, there may be more, and the state counts as unstable. So it
+    does if Arnoldi's method does not converge.
     """
     n = rest.shape[0]
+    if n <= DENSE_UP_TO:
+        count(multiply_adds=30 * n**3)
+        return not _diverges(scipy.linalg.eigvals(tangent.toarray(), rest.toarray())).any()
     factor = GeneralFactor(sp.csr_array(tangent + rest))
 
     def transformed(x: Array) -> Array:
         count(multiply_adds=rest.nnz)
         return x - 2.0 * factor.solve(rest @ x)
 
-    theta = sp_linalg.eigs(
-        sp_linalg.LinearOperator((n, n), matvec=transformed, dtype=np.float64),
-        EIGENVALUES,
-        which="LM",
-        v0=np.random.default_rng(0).normal(size=n),
-        tol=EIGENVALUE_TOLERANCE,
-        return_eigenvectors=False,
-    )
+    try:
+        theta = sp_linalg.eigs(
+            sp_linalg.LinearOperator((n, n), matvec=transformed, dtype=np.float64),
+            EIGENVALUES,
+            which="LM",
+            v0=np.random.default_rng(0).normal(size=n),
+            tol=EIGENVALUE_TOLERANCE,
+            return_eigenvectors=False,
+        )
+    except sp_linalg.ArpackNoConvergence:
+        return False
     mu = (1.0 + theta) / (1.0 - theta)
-    left = mu.real <= 0.0
-    diverges = left & (np.abs(mu.imag) <= REAL * np.abs(mu))
-    return not (diverges.any() or left.all())
+    return not (_diverges(mu).any() or (mu.real <= 0.0).all())
+
+
+def _diverges(mu: NDArray[np.complexfloating]) -> NDArray[np.bool_]:
+    """Return which eigenvalues are real and not positive."""
+    return np.asarray((mu.real <= 0.0) & (np.abs(mu.imag) <= REAL * np.abs(mu)))

@@ -65,6 +65,9 @@ class Ground:
     tool_nodes: NDArray[np.int64] | None
 
 
+HELD = "holds fixed nodes only, which no force can move."
+
+
 @dataclass(frozen=True)
 class Acting:
     """The patches of one table `[loads]`.
@@ -110,7 +113,11 @@ class Acting:
                 )
             for name, region in keyed.items():
                 with problems.keep():
-                    found.append(self._surface_points(region, name))
+                    points = self._surface_points(region, name)
+                    exact = isinstance(plan, Pressure | PointLoads) and not self.ground.embedded
+                    if exact and np.isin(points, self.ground.fixed_nodes).all():
+                        raise SpecError(f"`{name}` {HELD}")
+                    found.append(points)
         return found
 
     @cached_property
@@ -135,10 +142,6 @@ class Acting:
         region = self._loaded_points
         if isinstance(plan, PointLoads) and not self.ground.embedded:
             region = np.setdiff1d(region, self.ground.fixed_nodes)
-            if not len(region):
-                raise SpecError(
-                    f"`{self.key}.region` holds fixed nodes only, which no force can move."
-                )
         if plan.n_patches is None:
             return region
         points = surface.points[region]
@@ -224,7 +227,13 @@ class Acting:
                 if not isinstance(self.plan, LineLoads):
                     raise
                 raise SpecError(f"`loads.lines` must lie in the body: {error}") from None
-            return self._weights(sp.csr_array(shares @ at_nodes))
+            found = sp.csr_array(shares @ at_nodes)
+            if isinstance(self.plan, LineLoads):
+                for number in range(len(self.nodes)):
+                    row: sp.csr_array = found[[number]]
+                    if np.isin(row.indices[row.data != 0], self.ground.fixed_nodes).all():
+                        raise SpecError(f"`{self.key}.lines[{number}]` {HELD}")
+            return self._weights(found)
         return self._weights(sp.csr_array(self.patches.areas @ self.patches.values))
 
 

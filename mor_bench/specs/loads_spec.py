@@ -60,17 +60,18 @@ class _SampledForces(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        wrong = []
         if (self.samples_per_patch is None) == (self.samples is None):
-            raise ValueError("exactly one of `samples_per_patch` and `samples` must be given")
-        if self.simultaneous > 1 and self.samples is None:
-            raise ValueError(
-                "with `simultaneous` > 1 `samples` must be given, not `samples_per_patch`"
-            )
+            wrong.append("exactly one of `samples_per_patch` and `samples` must be given")
+        elif self.simultaneous > 1 and self.samples is None:
+            wrong.append("with `simultaneous` > 1 `samples` must be given, not `samples_per_patch`")
         if (self.simultaneous > 1) != (self.min_distance_m is not None):
-            raise ValueError(
+            wrong.append(
                 "`min_distance_m` must be given with `simultaneous` > 1 and only then; "
                 f"got `simultaneous` {self.simultaneous}"
             )
+        if wrong:
+            raise ValueError("; ".join(wrong))
         return self
 
 
@@ -348,21 +349,25 @@ class Several(StrictModel):
             "follower pressure" if getattr(table, "follower", False) else str(table.kind)
             for table in self.tables
         ]
+        wrong = []
         for alone in ("displacement", "contact", "follower pressure"):
             if alone in kinds:
                 place = kinds.index(alone)
                 other = kinds[1 if place == 0 else 0]
-                raise ValueError(
+                wrong.append(
                     f"`loads` cannot combine the kinds {alone!r} and {other!r}: only dead loads "
                     "act together; pressures that do not vary belong in `constant_pressures`"
                 )
+                break
         for name in ("samples", "steps"):
             values = [getattr(table, name) for table in self.tables]
             if None in values or len(set(values)) > 1:
-                raise ValueError(
+                wrong.append(
                     f"all tables `[[loads]]` must give the same `{name}`; got "
                     f"{', '.join('none' if value is None else str(value) for value in values)}"
                 )
+        if wrong:
+            raise ValueError("; ".join(wrong))
         return self
 
 

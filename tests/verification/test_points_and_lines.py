@@ -171,6 +171,7 @@ def test_named_test_sets_exist() -> None:
     [
         ({**POINT, "patch_area_m2": 0.1}, r"unknown key `loads.patch_area_m2`"),
         ({**POINT, "region": "x-min"}, "holds fixed nodes only"),
+        ({**LINE, "lines": [[[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]]]}, "holds fixed nodes only"),
         ({**POINT, "n_patches": 1000}, r"`n_patches` must be in \[1, 40\]"),
         ({**LINE, "lines": []}, r"`loads.lines`"),
         ({**LINE, "lines": [[EDGE[0], EDGE[0]]]}, r"the two ends of `lines\[0\]` must differ"),

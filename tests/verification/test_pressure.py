@@ -212,6 +212,10 @@ def test_methods_learn_pressures(tmp_path: Path) -> None:
     ("changed", "message"),
     [
         ({"split": {"by": "region"}}, "`split.by` must be 'sample' where"),
+        (
+            {"loads": {**LOADS, "regions": ["x-max", "x-min"]}, "supports": [{"region": "x-min"}]},
+            r"`loads.regions\[1\]` holds fixed nodes only",
+        ),
         ({"tests": {"paper_magnitude_n": [0.0, 1.0]}}, "`tests.paper_magnitude_n` must be absent"),
         (
             {"geometry": {**TUBE, "radii_m": [2.0, 1.0]}},

@@ -182,6 +182,7 @@ TOOL = {"kind": "displacement", "region": "x-max", "magnitude_m": [0.0, 0.1], "s
             "the same `samples`; got 20, none",
         ),
         ([PRESSURE, {**FORCE, "steps": 2}], "the same `steps`; got 1, 2"),
+        ([TOOL, {**FORCE, "samples": 30}], "cannot combine .*; .* the same `samples`; got 20, 30"),
         ([], r"`loads"),
         (
             [{**PRESSURE, "samples": 0}, {**FORCE, "magnitude_n": [2.0, 1.0]}],

@@ -144,14 +144,50 @@ def test_the_whole_tangent_is_a_derivative_on_oblique_planes() -> None:
     ],
 )
 def test_real_eigenvalues_decide_on_stability(blocks: list[Any], stable: bool) -> None:
-    generator, n = np.random.default_rng(0), 60
+    assert is_stable(*matrices(blocks, 60)) is stable
+
+
+FLUTTER = [[[-0.1, 0.1 * k], [-0.1 * k, -0.1]] for k in range(1, 5)]
+
+
+@pytest.mark.parametrize(
+    ("blocks", "stable"),
+    [([1e-3], True), ([-0.05], False), (FLUTTER, True), ([*FLUTTER, -2.0], False)],
+)
+def test_all_eigenvalues_of_few_unknowns_are_known(blocks: list[Any], stable: bool) -> None:
+    assert is_stable(*matrices(blocks, 10)) is stable
+
+
+def matrices(blocks: list[Any], n: int) -> tuple[sp.csr_array, sp.csr_array]:
+    """Return a tangent, with these eigenvalues and positive ones, and the stiffness at rest."""
+    generator = np.random.default_rng(0)
     own = scipy.linalg.block_diag(*blocks)
     mu = scipy.linalg.block_diag(own, np.diag(np.geomspace(0.1, 50.0, n - len(own))))
     root = np.eye(n) + 0.3 * generator.normal(size=(n, n))
     vectors = np.eye(n) + 0.05 * generator.normal(size=(n, n))
     rest = root @ root.T
     tangent = rest @ vectors @ mu @ np.linalg.inv(vectors)
-    assert is_stable(sp.csr_array(tangent), sp.csr_array(rest)) is stable
+    return sp.csr_array(tangent), sp.csr_array(rest)
+
+
+def test_a_cube_with_five_unknowns_inverts() -> None:
+    """One facet is pressed and another pulled, until the cube inverts; the reverse is stable."""
+    scene = pressed(
+        geometry={"shape": "box", "size_m": [1.0, 1.0, 1.0], "cells": [1, 1, 1]},
+        supports=[
+            {"region": "x-min"},
+            {"region": "y-min"},
+            {"region": "z-min", "components": ["z"]},
+        ],
+        loads={**FOLLOWING, "regions": ["z-max", "x-max"]},
+    )
+    model = PressedModel(scene)
+    assert model.n_unknowns == 5
+    areas = scene.patch_weights.toarray().reshape(2, 3, -1).transpose(0, 2, 1)
+    load = scene.at_free_dofs((areas[1] - areas[0]).reshape(1, -1))[0]
+    model.solve(0.8 * YOUNG_PA * load, options=TIGHT)
+    with pytest.raises(InvertedElementError):
+        model.solve(-YOUNG_PA * load, options=TIGHT)
 
 
 def test_a_singular_matrix_has_no_factor() -> None:
