@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,9 +88,28 @@ def test_a_fitted_method_is_calibrated_on_samples_that_it_has_not_seen(tiny: Dat
     assert errors.min() < bound.relative_l2 <= errors.max()
 
 
+def test_only_wanted_nodes_count(tiny: Dataset) -> None:
+    """The bound of a method that leaves out the other nodes is that of one that does not."""
+    needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max"})
+    scene = replace(tiny.scene, spec=tiny.scene.spec.model_copy(update={"needs": needs}))
+    method = mor_bench.load_method("pod", n_modes=10).fit(scene, tiny.train)
+    found = method.predict(tiny.test.forces[:3])
+    assert np.isnan(found).any()
+    bound = mor_bench.error_bound(method, replace(tiny.validation, scene=scene), level=0.5)
+    whole = mor_bench.load_method("pod", n_modes=10).fit(tiny.scene, tiny.train)
+    wanted = whole.predict(tiny.test.forces[:3])[:, scene.output_nodes]
+    share = bound.relative_l2 / (1.0 - bound.relative_l2)
+    expected = share * np.linalg.norm(wanted, axis=(1, 2))
+    np.testing.assert_allclose(bound.of_prediction(found), expected, rtol=1e-9)
+    np.testing.assert_allclose(bound.of_prediction(found[0]), expected[0], rtol=1e-9)
+
+
 def test_a_level_out_of_range_and_no_samples_are_refused(tiny: Dataset) -> None:
     method = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
     with pytest.raises(InvalidInputError, match=r"`level` of `error_bound` must be in \(0, 1\)"):
         mor_bench.error_bound(method, tiny.validation, level=90)
+    text: Any = "0.9"
+    with pytest.raises(InvalidInputError, match=r"must be in .*; got '0.9'"):
+        mor_bench.error_bound(method, tiny.validation, level=text)
     with pytest.raises(InvalidInputError, match="at least one sample; got 0"):
         mor_bench.error_bound(method, tiny.validation[:0])

@@ -286,7 +286,18 @@ def test_more_monomials_than_fit_into_memory_are_refused(
         )
 
 
-@pytest.mark.parametrize("name", ["pca-regression", "pca-regression-linear", "pca-kernel-ridge"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "linear-fem",
+        "pca-regression",
+        "pca-regression-linear",
+        "pca-kernel-ridge",
+        "pgd-snapshots",
+        "pgd-snapshots-force",
+        "pgd-weak-form",
+    ],
+)
 def test_a_query_for_few_outputs_costs_less_and_gives_the_same(tiny: Dataset, name: str) -> None:
     """Wanted displacements are those of a query for all; the others are NaN."""
     needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max"})

@@ -9,7 +9,7 @@ regions are exchangeable. It says nothing about other kinds of loads.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Any
 
@@ -39,6 +39,8 @@ class ErrorBound:
         groups for this level.
     n_samples, n_groups : int
         Samples of the calibration, and independent groups among them.
+    nodes : (n,) int64, optional
+        The nodes that count, where the scene's `[needs] outputs` is a part of them.
 
     Examples
     --------
@@ -54,6 +56,7 @@ class ErrorBound:
     relative_l2: float
     n_samples: int
     n_groups: int
+    nodes: NDArray[np.int64] | None = field(default=None, compare=False)
 
     def of_prediction(self, displacements: ArrayLike) -> NDArray[np.float64]:
         """Return the bound of the norm of each prediction's error, m.
@@ -71,7 +74,9 @@ class ErrorBound:
         -------
         array of shape () or (n,)
         """
-        norm = np.linalg.norm(np.asarray(displacements, dtype=np.float64), axis=(-2, -1))
+        counting = slice(None) if self.nodes is None else self.nodes
+        found = np.asarray(displacements, dtype=np.float64)[..., counting, :]
+        norm = np.linalg.norm(found, axis=(-2, -1))
         share = self.relative_l2
         return np.asarray(share / (1 - share) * norm if share < 1 else np.full(norm.shape, inf))
 
@@ -102,14 +107,16 @@ def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> 
     >>> error_bound(linear, data.train, level=0.5).relative_l2 < 0.2
     True
     """
-    if not 0 < level < 1:
+    if not (isinstance(level, float) and 0 < level < 1):
         raise InvalidInputError(f"`level` of `error_bound` must be in (0, 1); got {level!r}.")
     if len(samples) == 0:
         raise InvalidInputError("`samples` of `error_bound` must hold at least one sample; got 0.")
     scene, given = samples.scene, samples.given
     predicted = predict_all(method, given)
     errors = sample_errors(predicted, samples.displacements, scene.output_nodes)
-    return calibrated(errors.relative_l2, samples.regions, level)
+    bound = calibrated(errors.relative_l2, samples.regions, level)
+    part = len(scene.output_nodes) < scene.mesh.n_nodes
+    return replace(bound, nodes=scene.output_nodes) if part else bound
 
 
 def calibrated(

@@ -152,8 +152,13 @@ class Compliance:
             return frames.to_global(self._respond(frames.to_local(loads)))
         return self._respond(loads)
 
-    def at(self, dofs: NDArray[np.int64]) -> Callable[[Array], Array]:
-        """Return a function of loads (n, n_dofs), N, that gives `respond` at some dofs only, m."""
+    def at(self, dofs: NDArray[np.int64] | None) -> Callable[[Array], Array]:
+        """Return a function of loads (n, n_dofs), N, that gives `respond` at some dofs only, m.
+
+        None stands for all dofs.
+        """
+        if dofs is None:
+            return self.respond
         if self._scene.frames is not None or not len(self.columns):
             return lambda loads: self.respond(loads)[:, dofs]
         columns = np.ascontiguousarray(self.columns[:, dofs])

@@ -20,6 +20,21 @@ def extent_of(scene: Scene) -> float:
     return float(np.ptp(scene.mesh.points, axis=0).max() * np.sqrt(len(scene.free_dofs)))
 
 
+def wanted_dofs(scene: Scene) -> NDArray[np.int64] | None:
+    """Return the dofs of the nodes in ``scene.spec.needs.outputs``; None if those are all."""
+    nodes = scene.output_nodes
+    return None if len(nodes) == scene.mesh.n_nodes else dofs_of_nodes(nodes)
+
+
+def at_wanted(values: Array, wanted: NDArray[np.int64] | None, n_dofs: int) -> Array:
+    """Return values (n, n_wanted) of the wanted dofs on all dofs (n, n_dofs), else NaN."""
+    if wanted is None:
+        return values
+    out = np.full((len(values), n_dofs), np.nan)
+    out[:, wanted] = values
+    return out
+
+
 class Subspace:
     """The displacements u = Φq on the nodes of a scene.
 
@@ -36,8 +51,7 @@ class Subspace:
         self.n_modes = modes.shape[1]
         self._modes = scene.columns_at_all_dofs(modes)
         self._free = scene.free_dofs
-        nodes = scene.output_nodes
-        self._wanted = None if len(nodes) == scene.mesh.n_nodes else dofs_of_nodes(nodes)
+        self._wanted = wanted_dofs(scene)
         self._expanding = self._modes if self._wanted is None else self._modes[self._wanted]
 
     def project(self, load: Array) -> Array:

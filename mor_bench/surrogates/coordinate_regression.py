@@ -22,7 +22,7 @@ from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import error_weights, input_axes
 from mor_bench.reduction.sensitivity import sensitivities
-from mor_bench.scene.dofs import dofs_of_nodes
+from mor_bench.reduction.subspace import at_wanted, wanted_dofs
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.given import ObservedDisplacements
@@ -206,18 +206,17 @@ class CoordinateRegression(Surrogate, ABC):
             self._respond_to(scene)
         if self.input == "force" or not scene.parameter_names:
             self.from_forces_ = self._to_coordinates(self.axes_)
-        expanding, nodes = scene.columns_at_all_dofs(self.modes_), scene.output_nodes
-        self._wanted: NDArray[np.int64] | None = None
+        expanding = scene.columns_at_all_dofs(self.modes_)
+        self._wanted = None if scene.parameter_names else wanted_dofs(scene)
         self._respond_at: Callable[[Array], Array] | None = None
-        if len(nodes) < scene.mesh.n_nodes and not scene.parameter_names:
-            self._wanted = dofs_of_nodes(nodes)
+        if self._wanted is not None:
             expanding = expanding[self._wanted]
             if self._adds_response and isinstance(self.response_, Compliance):
                 self._respond_at = self.response_.at(self._wanted)
         self._expanding = np.ascontiguousarray(expanding.T)
 
     def answer(self, forces: Array) -> Array:
-        loads, wanted = forces.reshape(-1, self.scene_.mesh.n_dofs), self._wanted
+        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
         if self._kinked:
             loads = self.response_.respond(loads)
         coefficients = self.coefficients(project(self.from_forces_, loads))
@@ -225,11 +224,7 @@ class CoordinateRegression(Surrogate, ABC):
         out = coefficients @ self._expanding
         if self._adds_response:
             out += self._added(loads)
-        if wanted is not None:
-            whole = np.full(loads.shape, np.nan)
-            whole[:, wanted] = out
-            out = whole
-        return out.reshape(forces.shape)
+        return at_wanted(out, self._wanted, loads.shape[1]).reshape(forces.shape)
 
     def _added(self, loads: Array) -> Array:
         """Return the linear response at the wanted dofs; ``loads`` is it where it is kinked."""

@@ -9,9 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.moved_bodies import parametric_response
 from mor_bench.mechanics.observed import linear_response
+from mor_bench.reduction.subspace import at_wanted, wanted_dofs
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
@@ -36,10 +38,14 @@ class LinearFEM(Surrogate):
             self.responses_ = parametric_response(scene)
         else:
             self.compliance_ = linear_response(scene)
+            self._wanted, self._respond = None, self.compliance_.respond
+            if isinstance(self.compliance_, Compliance):
+                self._wanted = wanted_dofs(scene)
+                self._respond = self.compliance_.at(self._wanted)
 
     def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
-        return self.compliance_.respond(loads).reshape(forces.shape)
+        return at_wanted(self._respond(loads), self._wanted, loads.shape[1]).reshape(forces.shape)
 
     def answer_parametric(
         self, forces: NDArray[np.float64], parameters: NDArray[np.float64]

@@ -21,6 +21,7 @@ from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.separated import Family, Term, separate
+from mor_bench.reduction.subspace import at_wanted, wanted_dofs
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.specs import DatasetSpec
@@ -203,6 +204,11 @@ class SeparatedLoad(Surrogate):
         self.by_power_ = take_array(model, "by_power", (self.force_degree, n_terms))
         if self.base == "linear-response" and not hasattr(self, "compliance_"):
             self.compliance_ = Compliance(FullOrderModel(scene))
+        self._wanted = wanted_dofs(scene)
+        rows = slice(None) if self._wanted is None else self._wanted
+        self._expanding = np.ascontiguousarray(scene.columns_at_all_dofs(self.modes_)[rows].T)
+        if self.base == "linear-response":
+            self._respond = self.compliance_.at(self._wanted)
 
     def answer(self, forces: Array) -> Array:
         scene = self.scene_
@@ -215,13 +221,14 @@ class SeparatedLoad(Surrogate):
         )
         functions = position.shape[1] + direction.shape[1] + powers.shape[1]
         coefficients = self.by_position_.size + self.by_direction_.size + self.by_power_.size
-        expansion = self.vectors_.size + self.modes_.size
+        expansion = self.vectors_.size + min(self._expanding.size, self.modes_.size)
         products = coefficients + 2 * terms.shape[1] + functions + expansion
         count(multiply_adds=len(forces) * (products + 7 * scene.mesh.n_nodes))
-        out = scene.at_all_dofs((terms @ self.vectors_) @ self.modes_.T)
+        out = (terms @ self.vectors_) @ self._expanding
+        loads = forces.reshape(len(forces), scene.mesh.n_dofs)
         if self.base == "linear-response":
-            out += self.compliance_.respond(forces.reshape(out.shape))
-        return out.reshape(forces.shape)
+            out += self._respond(loads)
+        return at_wanted(out, self._wanted, loads.shape[1]).reshape(forces.shape)
 
 
 def load_coordinates(points: Array, forces: Array) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.alternating_directions import decompose
 from mor_bench.reduction.load_grid import load_grid
+from mor_bench.reduction.subspace import at_wanted, wanted_dofs
 from mor_bench.reduction.tensors import has_polynomial
 from mor_bench.reduction.weak_form import Family, Term, WeakForm
 from mor_bench.scene.scene import Scene
@@ -160,6 +161,11 @@ class WeakFormPGD(Surrogate):
         self.history_ = take_array(model, "history", (None, 3))
         if self.base == "linear-response":
             self.compliance_ = Compliance(FullOrderModel(scene))
+        self._wanted = wanted_dofs(scene)
+        rows = slice(None) if self._wanted is None else self._wanted
+        self._expanding = np.ascontiguousarray(scene.at_all_dofs(self.vectors_)[:, rows])
+        if self.base == "linear-response":
+            self._respond = self.compliance_.at(self._wanted)
 
     def answer(self, forces: Array) -> Array:
         scene = self.scene_
@@ -178,11 +184,13 @@ class WeakFormPGD(Surrogate):
         functions = direction.shape[1] + powers.shape[1]
         products = self.by_direction_.size + self.by_power_.size + 2 * terms.shape[1] + functions
         places = 7 * scene.mesh.n_nodes + self.centroids_.size
-        count(multiply_adds=len(forces) * (products + self.vectors_.size + places))
-        out = scene.at_all_dofs(terms @ self.vectors_)
+        expansion = min(self._expanding.size, self.vectors_.size)
+        count(multiply_adds=len(forces) * (products + expansion + places))
+        out = terms @ self._expanding
+        loads = forces.reshape(len(forces), scene.mesh.n_dofs)
         if self.base == "linear-response":
-            out += self.compliance_.respond(forces.reshape(out.shape))
-        return out.reshape(forces.shape)
+            out += self._respond(loads)
+        return at_wanted(out, self._wanted, loads.shape[1]).reshape(forces.shape)
 
 
 def _centroids(scene: Scene) -> Array:
