@@ -349,16 +349,12 @@ class Several(StrictModel):
             "follower pressure" if getattr(table, "follower", False) else str(table.kind)
             for table in self.tables
         ]
-        wrong = []
-        for alone in ("displacement", "contact", "follower pressure"):
-            if alone in kinds:
-                place = kinds.index(alone)
-                other = kinds[1 if place == 0 else 0]
-                wrong.append(
-                    f"`loads` cannot combine the kinds {alone!r} and {other!r}: only dead loads "
-                    "act together; pressures that do not vary belong in `constant_pressures`"
-                )
-                break
+        wrong = [
+            f"`loads` cannot combine the kinds {kind!r} and {kinds[kinds[0] == kind]!r}: only dead "
+            "loads act together; pressures that do not vary belong in `constant_pressures`"
+            for kind in ("displacement", "contact", "follower pressure")
+            if kind in kinds
+        ][:1]
         for name in ("samples", "steps"):
             values = [getattr(table, name) for table in self.tables]
             if None in values or len(set(values)) > 1:
