@@ -350,8 +350,8 @@ class Several(StrictModel):
             for table in self.tables
         ]
         wrong = [
-            f"`loads` cannot combine the kinds {kind!r} and {kinds[kinds[0] == kind]!r}: only dead "
-            "loads act together; pressures that do not vary belong in `constant_pressures`"
+            f"`loads` cannot combine the kinds {kind!r} and {kinds[int(kinds[0] == kind)]!r}: only "
+            "dead loads act together; pressures that do not vary belong in `constant_pressures`"
             for kind in ("displacement", "contact", "follower pressure")
             if kind in kinds
         ][:1]
