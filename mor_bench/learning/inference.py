@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +30,7 @@ from mor_bench.learning.packed_network import packed
 
 Backend = Literal["eager", "packed", "onnx", "packed-bfloat16", "cuda"]
 
-BACKENDS: tuple[Backend, ...] = ("eager", "packed", "onnx", "packed-bfloat16")
+BACKENDS: tuple[Backend, ...] = get_args(Backend)[:-1]
 """Back ends of processors, from simple to complex. Each must be clearly faster than the choice
 before it."""
 

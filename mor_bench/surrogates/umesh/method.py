@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, final
 
@@ -25,15 +25,7 @@ from mor_bench.mechanics.model import unknown_equations
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.symmetry import Mirror, mirrors
-from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogates.field_surrogate import Arrays, FieldSurrogate, Input
-from mor_bench.surrogates.umesh.axes import (
-    Axes,
-    inverse,
-    longest_last,
-    turned_grid,
-    turned_kernels,
-)
 from mor_bench.surrogates.umesh.network import Activation, UNet, draw_weights, empty_network
 from mor_bench.surrogates.umesh.onnx_model import UMeshParts, umesh_graph
 from mor_bench.surrogates.umesh.padded_grid import PaddedGrid, padded_grid
@@ -104,11 +96,7 @@ class UMesh(FieldSurrogate):
     network_ : UNet
     inference_ : Inference
         The network in the form that `predict` calls.
-    axes_ : tuple of int
-        The axis of the mesh along each axis of the network, see `mor_bench.surrogates.umesh.axes`.
-        Saved weights are in the order of the mesh, so they fit other grids.
     grid_ : PaddedGrid
-        The grid in the order of the network.
     validation_curve_ : (n_validations,) float64
         Loss of the held-out samples, at intervals of a fiftieth of the iterations; empty if none
         are held out.
@@ -150,10 +138,8 @@ class UMesh(FieldSurrogate):
 
     def set_up(self, scene: Scene) -> None:
         super().set_up(scene)
-        if not hasattr(self, "grid_"):
-            grid = grid_map(scene.mesh, scene.spec.grid_nodes)
-            self.axes_: Axes = longest_last(grid.shape)
-            self.grid_: PaddedGrid = padded_grid(turned_grid(grid, self.axes_), self.steps)
+        grid = grid_map(scene.mesh, scene.spec.grid_nodes)
+        self.grid_: PaddedGrid = padded_grid(grid, self.steps)
 
     def scale(self, values: NDArray[np.float64]) -> float:
         if self.normalisation == "none":
@@ -166,24 +152,7 @@ class UMesh(FieldSurrogate):
         return empty_network(self.channels, self.steps, self.activation)
 
     def initialise(self, network: UNet, generator: torch.Generator) -> UNet:
-        drawn = draw_weights(network, generator)
-        drawn.load_state_dict(self._turned(drawn.state_dict()))
-        return drawn
-
-    def turned(self, weights: dict[str, Tensor], source: Arrays, target: Arrays) -> Any:
-        return self._turned(weights)
-
-    def _turned(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return weights in the order of the network's axes."""
-        arrays = {name: value.numpy() for name, value in weights.items()}
-        return {k: torch.from_numpy(v) for k, v in turned_kernels(arrays, self.axes_).items()}
-
-    def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
-        return turned_kernels(super().learn(scene, samples), inverse(self.axes_))
-
-    def prepare(self, scene: Scene, model: Arrays) -> None:
-        self.set_up(scene)
-        super().prepare(scene, turned_kernels(model, self.axes_))
+        return draw_weights(network, generator)
 
     def training_data(self, network: UNet, inputs: Tensor, targets: Tensor) -> dict[str, Tensor]:
         return {"inputs": inputs, "targets": targets}
