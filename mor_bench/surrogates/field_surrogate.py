@@ -170,7 +170,7 @@ class FieldSurrogate(Surrogate, ABC):
         if self.plan().validation_fraction > 0 and self.training.validation is not None:
             held = self._pairs(self.training.validation)
             known.append((_single(held[0] / scales[0]), _single(held[1] / scales[1])))
-        done = self._train(network, known, generator)
+        done = self.train_network(network, known, generator)
         self.network_ = network.cpu()
         self.finish(_single(inputs), _single(targets))
         weights = self.network_.state_dict()
@@ -184,13 +184,13 @@ class FieldSurrogate(Surrogate, ABC):
         given, wanted = self._network_input(samples.given.values), samples.displacements
         return given, wanted - given if self.input == "linear-response" else wanted
 
-    def _train(
+    def train_network(
         self,
         network: nn.Module,
         known: Sequence[tuple[Tensor, Tensor]],
         generator: torch.Generator,
     ) -> Training:
-        """Train on inputs and targets: those to learn from, and perhaps those to validate on."""
+        """Train on scaled samples: those to learn from, and perhaps those to validate on."""
         device = device_of(self.training)
         inputs, targets = (torch.cat(parts) for parts in zip(*known, strict=True))
         data = self.training_data(network, inputs, targets)

@@ -12,6 +12,8 @@ from tests.benchmarks.umesh_scaling import HELD_OUT, PAPER, fit_law
 from tests.published.run_tables import markdown
 from tests.published.stored import content_of
 
+PARTS = ("forward", "backward", "optimiser")
+
 Rows = list[dict[str, Any]]
 
 PAPER_E_M = next(
@@ -142,6 +144,26 @@ def full_sizes(source: str, dataset: str) -> str:
     headings = ["method", "size", "weights", "iterations", "trained, s", "ē, m", "σ(e), m"]
     headings += ["largest e, m", "relative L2 error, %: median / p95", "tip at largest u, %"]
     return markdown([*headings, "network, replayed / launched by PyTorch, ms"], body)
+
+
+def training_speed(source: str) -> str:
+    """Show the times of a training step of U-Mesh with the axes of its grid in two orders."""
+    rows: Rows = content_of(source)["rows"]
+    first = {row["scene"]: row for row in reversed(rows)}
+    body = []
+    for row in rows:
+        total, before = (
+            sum(found[f"{part}_ms"] for part in PARTS) for found in (row, first[row["scene"]])
+        )
+        body.append(
+            [
+                f"{row['scene']}, batch of {row['batch_size']}",
+                f"{row['choice']}: {row['grid']}",
+                *(number(row[f"{part}_ms"]) for part in PARTS),
+                number(total / before),
+            ]
+        )
+    return markdown(["scene", "axes", *(f"{part}, ms" for part in PARTS), "whole step"], body)
 
 
 def _rows_of(source: str) -> Rows:

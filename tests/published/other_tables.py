@@ -30,6 +30,7 @@ from tests.published.network_size_tables import (
     network_sizes,
     paper_size,
     paper_size_latency,
+    training_speed,
 )
 from tests.published.projection_tables import projections, reconstructions
 from tests.published.record import SOURCES, experiments, record_of
@@ -370,6 +371,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "network-size-law": network_size_law,
     "fronts": fronts,
     "full-sizes": full_sizes,
+    "training-speed": training_speed,
     "paper-size": paper_size,
     "paper-size-latency": paper_size_latency,
     "paper-amplitude": paper_amplitude,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, final
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from mor_bench.errors import UnsupportedSceneError
 from mor_bench.learning.cuda_graphs import volumes_last
@@ -20,12 +20,14 @@ from mor_bench.learning.inference import (
     choose_inference,
     inference_or_eager,
 )
+from mor_bench.learning.training import Training
 from mor_bench.learning.training_plan import Loss, Precision, Schedule, TrainingPlan
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.symmetry import Mirror, mirrors
 from mor_bench.surrogates.field_surrogate import Arrays, FieldSurrogate, Input
+from mor_bench.surrogates.umesh.axes import inverse, longest_last, turn_kernels, turned_grid
 from mor_bench.surrogates.umesh.network import Activation, UNet, draw_weights, empty_network
 from mor_bench.surrogates.umesh.onnx_model import UMeshParts, umesh_graph
 from mor_bench.surrogates.umesh.padded_grid import PaddedGrid, padded_grid
@@ -153,6 +155,22 @@ class UMesh(FieldSurrogate):
 
     def initialise(self, network: UNet, generator: torch.Generator) -> UNet:
         return draw_weights(network, generator)
+
+    def train_network(
+        self,
+        network: nn.Module,
+        known: Sequence[tuple[Tensor, Tensor]],
+        generator: torch.Generator,
+    ) -> Training:
+        """Train with the longest axis last; packed predictions want the order of the mesh."""
+        grid = grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes)
+        axes, kept = longest_last(grid.shape), self.grid_
+        turn_kernels(network, axes)
+        self.grid_ = padded_grid(turned_grid(grid, axes), self.steps)
+        done = super().train_network(network, known, generator)
+        self.grid_ = kept
+        turn_kernels(network, inverse(axes))
+        return done
 
     def training_data(self, network: UNet, inputs: Tensor, targets: Tensor) -> dict[str, Tensor]:
         return {"inputs": inputs, "targets": targets}
