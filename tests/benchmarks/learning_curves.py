@@ -41,6 +41,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "transolver": LINEAR_RESPONSE,
     "graph-u-net": LINEAR_RESPONSE,
     "mesh-graph-net": LINEAR_RESPONSE,
+    "umesh-small": {},
+    "pod-nn-force": {},
+    "pod-ann": {},
+    "latent-galerkin": {},
 }
 """Methods, and parameters that replace those of their files."""
 
