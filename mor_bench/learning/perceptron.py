@@ -74,7 +74,7 @@ class Perceptron(nn.Module):
 def evaluate(weights: Sequence[Array], x: Array) -> Array:
     """Return the values at x (n, n_inputs) of a network given by `Perceptron.arrays`."""
     first, first_bias, second, second_bias, last = weights
-    return _silu(_silu(x @ first + first_bias) @ second + second_bias) @ last
+    return silu(silu(x @ first + first_bias) @ second + second_bias) @ last
 
 
 def slope_at_rest(weights: Sequence[Array]) -> Array:
@@ -82,7 +82,7 @@ def slope_at_rest(weights: Sequence[Array]) -> Array:
     first, first_bias, second, second_bias, last = weights
     before = first_bias
     slope = first * _silu_slope(before)
-    before = _silu(before) @ second + second_bias
+    before = silu(before) @ second + second_bias
     return (slope @ second * _silu_slope(before)) @ last
 
 
@@ -111,7 +111,7 @@ def _shapes(n_inputs: int, n_hidden: int, n_outputs: int) -> list[tuple[int, ...
     return shapes[:-1]
 
 
-def _silu(x: Array) -> Array:
+def silu(x: Array) -> Array:
     """x / (1 + exp(-x)) without overflow."""
     return 0.5 * x * (1.0 + np.tanh(0.5 * x))
 

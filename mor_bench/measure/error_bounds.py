@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,14 @@ from mor_bench.surrogate import Surrogate
 
 LEVEL = 0.9
 """Default share of loads whose error the bound holds for."""
+
+
+@runtime_checkable
+class Ensemble(Protocol):
+    """A method whose answer is the mean of members that may disagree."""
+
+    def spread(self, forces: ArrayLike) -> NDArray[np.float64]:
+        """Return the disagreement relative to the prediction, of shape () or (n,)."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +49,9 @@ class ErrorBound:
         Samples of the calibration, and independent groups among them.
     nodes : (n,) int64, optional
         The nodes that count, where the scene's `[needs] outputs` is a part of them.
+    per_spread : float, optional
+        Another bound of the same error, of an ensemble: its `spread` times this factor, so that
+        loads on which the members disagree have wider bounds. Infinite as `relative_l2`.
 
     Examples
     --------
@@ -57,8 +68,11 @@ class ErrorBound:
     n_samples: int
     n_groups: int
     nodes: NDArray[np.int64] | None = field(default=None, compare=False)
+    per_spread: float | None = None
 
-    def of_prediction(self, displacements: ArrayLike) -> NDArray[np.float64]:
+    def of_prediction(
+        self, displacements: ArrayLike, spread: ArrayLike | None = None
+    ) -> NDArray[np.float64]:
         """Return the bound of the norm of each prediction's error, m.
 
         A relative bound b < 1 gives the error at most b / (1 - b) times the norm of the prediction,
@@ -69,16 +83,30 @@ class ErrorBound:
         ----------
         displacements : (n_nodes, 3) or (n, n_nodes, 3)
             Predictions û, m.
+        spread : float or (n,), optional
+            The ensemble's `spread` for these loads; then b is `per_spread` times it.
 
         Returns
         -------
         array of shape () or (n,)
+
+        Raises
+        ------
+        InvalidInputError
+            If a spread is given and the method is no ensemble.
         """
         counting = slice(None) if self.nodes is None else self.nodes
         found = np.asarray(displacements, dtype=np.float64)[..., counting, :]
         norm = np.linalg.norm(found, axis=(-2, -1))
-        share = self.relative_l2
-        return np.asarray(share / (1 - share) * norm if share < 1 else np.full(norm.shape, inf))
+        share = np.asarray(self.relative_l2)
+        if spread is not None:
+            if self.per_spread is None:
+                raise InvalidInputError(
+                    "`spread` must be left out: this is not the bound of an ensemble."
+                )
+            share = self.per_spread * np.asarray(spread, dtype=np.float64)
+        within = np.where(share < 1, share, 0.0)
+        return np.asarray(np.where(share < 1, within / (1 - within) * norm, inf))
 
 
 def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> ErrorBound:
@@ -106,6 +134,14 @@ def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> 
     >>> linear = mor_bench.load_method("linear-fem").fit(data.scene)
     >>> error_bound(linear, data.train, level=0.5).relative_l2 < 0.2
     True
+
+    An ensemble also gives every load a bound of its own:
+
+    >>> ensemble = mor_bench.load_method("pod-nn-ensemble", iterations=50)
+    >>> bound = error_bound(ensemble.fit(data.scene, data.train), data.train, level=0.5)
+    >>> forces = data.test.forces
+    >>> bound.of_prediction(ensemble.predict(forces), ensemble.spread(forces)).shape
+    (40,)
     """
     if not (isinstance(level, float) and 0 < level < 1):
         raise InvalidInputError(f"`level` of `error_bound` must be in (0, 1); got {level!r}.")
@@ -114,13 +150,17 @@ def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> 
     scene, given = samples.scene, samples.given
     predicted = predict_all(method, given)
     errors = sample_errors(predicted, samples.displacements, scene.output_nodes)
-    bound = calibrated(errors.relative_l2, samples.regions, level)
+    spreads = method.spread(given.query) if isinstance(method, Ensemble) else None
+    bound = calibrated(errors.relative_l2, samples.regions, level, spreads)
     part = len(scene.output_nodes) < scene.mesh.n_nodes
     return replace(bound, nodes=scene.output_nodes) if part else bound
 
 
 def calibrated(
-    errors: NDArray[np.float64], regions: NDArray[np.int64] | None, level: float = LEVEL
+    errors: NDArray[np.float64],
+    regions: NDArray[np.int64] | None,
+    level: float = LEVEL,
+    spreads: NDArray[np.float64] | None = None,
 ) -> ErrorBound:
     """Return the bound from the relative L2 errors (n,) of a calibration set.
 
@@ -131,23 +171,41 @@ def calibrated(
         Load regions of the samples. Samples with several forces share regions in many ways, so each
         counts as a group of its own. So does each sample if `regions` is None.
     level : float
+    spreads : (n,) float64, optional
+        Those of an ensemble; they give the bound `per_spread`.
     """
     groups = np.arange(len(errors))
     if regions is not None and regions.ndim == 1:
         groups = np.unique(regions, return_inverse=True)[1]
     n_groups = int(groups.max()) + 1
     mass = 1.0 / np.bincount(groups)[groups] / (n_groups + 1)
-    order = np.argsort(errors, kind="stable")
+    per_spread = None
+    if spreads is not None:
+        scores = np.where(errors > 0, inf, 0.0)
+        np.divide(errors, spreads, out=scores, where=spreads > 0)
+        per_spread = _quantile(scores, mass, level)
+    bound = _quantile(errors, mass, level)
+    return ErrorBound(level, bound, len(errors), n_groups, per_spread=per_spread)
+
+
+def _quantile(values: NDArray[np.float64], mass: NDArray[np.float64], level: float) -> float:
+    """Return the least value whose mass with that of all lower ones reaches the level, or inf."""
+    order = np.argsort(values, kind="stable")
     reached = np.flatnonzero(np.cumsum(mass[order]) >= level - 1e-12)
-    bound = float(errors[order[reached[0]]]) if len(reached) else inf
-    return ErrorBound(level, bound, len(errors), n_groups)
+    return float(values[order[reached[0]]]) if len(reached) else inf
 
 
-def covered(bound: ErrorBound, scores: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Return the share of the samples of each test set whose error keeps the bound."""
-    if not isfinite(bound.relative_l2):
+def covered(
+    bound: ErrorBound, scores: Mapping[str, Mapping[str, Any]], *, scaled: bool = False
+) -> dict[str, float]:
+    """Return the share of the samples of each test set whose error keeps the bound.
+
+    With `scaled`, it is the bound `per_spread` of an ensemble.
+    """
+    share = bound.per_spread if scaled else bound.relative_l2
+    if share is None or not isfinite(share):
         return {}
     return {
-        name: float((score["relative_l2"] <= bound.relative_l2).mean())
+        name: float((score["relative_l2"] <= share * (score["spread"] if scaled else 1.0)).mean())
         for name, score in scores.items()
     }

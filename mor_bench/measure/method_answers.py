@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from mor_bench.sandbox.session import Answer
 
@@ -25,6 +27,12 @@ class Flagged(Answer):
     """Flags of loads out of range; None if the method has none."""
 
     flagged: list[bool] | None
+
+
+class Spread(Answer):
+    """Disagreement of an ensemble for each load; None for other methods."""
+
+    spread: list[Annotated[float, Field(ge=0, allow_inf_nan=False)]] | None
 
 
 class Counted(Answer):
@@ -59,6 +67,7 @@ class Throughput(Answer):
 ANSWERS: Mapping[str, type[Answer]] = {
     "fit": Fitted,
     "flag": Flagged,
+    "spread": Spread,
     "cost": Counted,
     "warm": Warm,
     "time": Timed,

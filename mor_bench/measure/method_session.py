@@ -24,6 +24,7 @@ from mor_bench.errors import (
     UnknownRangeError,
 )
 from mor_bench.machine import peak_memory_bytes, pinned_threads
+from mor_bench.measure.error_bounds import Ensemble
 from mor_bench.measure.fit_clock import fit_clock
 from mor_bench.measure.method_answers import ANSWERS
 from mor_bench.measure.predictions import predict_all
@@ -117,6 +118,7 @@ class MethodSession(Session):
         "throughput": "timing batches",
         "cost": "counting the cost",
         "flag": "flagging loads out of range",
+        "spread": "measuring the disagreement of an ensemble",
     }
     answers: ClassVar[Mapping[str, type[Answer]]] = ANSWERS
 
@@ -209,6 +211,17 @@ class MethodSession(Session):
                 f"returned shape {flagged.shape}."
             )
         return {"flagged": [bool(flag) for flag in flagged]}
+
+    def spread(self, forces: Array, parameters: Array | None = None) -> dict[str, Any]:
+        """Return how much the members of an ensemble disagree; None for other methods."""
+        if not isinstance(self.method, Ensemble):
+            return {"spread": None}
+        found = self.method.spread(given_of(self.scene, forces, parameters).query)
+        if found.shape != (len(forces),) or not (np.isfinite(found) & (found >= 0)).all():
+            raise InvalidInputError(
+                f"`spread` must return {len(forces)} finite numbers >= 0, one per load."
+            )
+        return {"spread": found.tolist()}
 
     def cost(self, forces: Array, parameters: Array | None = None) -> dict[str, Any]:
         """Count the work of a query, averaged over some loads."""

@@ -101,15 +101,15 @@ def error_bounds(entries: Sequence[Entry]) -> TextTable | None:
     for entry in bounded:
         found = entry.row.bound
         assert found is not None
-        shares = (found.coverage.get(name) for name in names)
-        rows.append(
-            [
-                entry.label,
-                percent(found.relative_l2),
-                f"{found.n} in {found.n_groups}",
-                *(DASH if share is None else percent(share) for share in shares),
-            ]
-        )
+        samples = f"{found.n} in {found.n_groups}"
+        bounds = [(entry.label, found.relative_l2, found.coverage)]
+        if found.scaled and "test" in found.scaled.widths:
+            label = f"{entry.label} × spread"
+            bounds.append((label, found.scaled.widths["test"], found.scaled.coverage))
+        for label, width, coverage in bounds:
+            shares = (coverage.get(name) for name in names)
+            shown = (DASH if share is None else percent(share) for share in shares)
+            rows.append([label, percent(width), samples, *shown])
     level = percent(bounded[0].row.bound.level if bounded[0].row.bound else None)
     note = (
         f"Bound: {level} % of new loads have at most this relative L2 error, if they are like the "
@@ -117,6 +117,11 @@ def error_bounds(entries: Sequence[Entry]) -> TextTable | None:
         "regions as groups. Other columns: the share of each "
         "test set within the bound (%)."
     )
+    if any(e.row.bound.scaled for e in bounded if e.row.bound):
+        note += (
+            " × spread: every load has a bound of its own, proportional to the disagreement of "
+            "the ensemble; shown is the median over the test."
+        )
     headings = ["configuration", "bound (%)", "samples in groups", *names]
     return TextTable("Error bounds", note, headings, rows)
 

@@ -164,6 +164,22 @@ class RangeFlags(Part):
     test: FlagCounts
 
 
+class ScaledBound(Part):
+    """A bound of the error that is a multiple of the spread of an ensemble.
+
+    Attributes
+    ----------
+    per_spread : float
+        The factor; infinite if there are too few groups.
+    widths, coverage : dict of str to float
+        Median of the bound on each test set, as a fraction, and share of the samples within it.
+    """
+
+    per_spread: Real
+    widths: Annotated[dict[str, Real], BeforeValidator(_few)] = Field(default={})
+    coverage: Annotated[dict[str, Real], BeforeValidator(_few)] = Field(default={})
+
+
 class BoundQuality(Part):
     """A bound of the error from the validation samples, and its coverage of each test set.
 
@@ -177,6 +193,8 @@ class BoundQuality(Part):
         Validation samples, and independent groups among them.
     coverage : dict of str to float
         Share of the samples of each test set whose error is within the bound.
+    scaled : ScaledBound or None
+        The bound that follows the spread of an ensemble.
     """
 
     level: Real
@@ -184,6 +202,7 @@ class BoundQuality(Part):
     n: int
     n_groups: int
     coverage: Annotated[dict[str, Real], BeforeValidator(_few)] = Field(default={})
+    scaled: ScaledBound | None = None
 
 
 class Row(Part):

@@ -46,6 +46,7 @@ from mor_bench.runs.row_figures import (
     ignored_seconds,
     loss_curves,
     n_failed,
+    scaled_bound,
     set_errors,
     training_record,
 )
@@ -336,13 +337,14 @@ class DatasetRun:
             return None
         by = self.context.options.split or self.spec.split.by
         regions = self.data.validation.regions if by == "region" else None
-        bound = calibrated(held["relative_l2"], regions)
+        bound = calibrated(held["relative_l2"], regions, spreads=held.get("spread"))
         return BoundQuality(
             level=bound.level,
             relative_l2=bound.relative_l2,
             n=bound.n_samples,
             n_groups=bound.n_groups,
             coverage=covered(bound, tests),
+            scaled=scaled_bound(bound, tests),
         )
 
 

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import MissingDependencyError, MorBenchError, UnsupportedSceneError
+from mor_bench.measure.error_bounds import ErrorBound, covered
 from mor_bench.measure.error_metrics import ERRORS, SampleErrors, percentiles, summary
 from mor_bench.measure.method_session import CURVES
 from mor_bench.measure.range_flags import Flags
 from mor_bench.results.parts import ErrorSummary, TrainingRecord
-from mor_bench.results.row import Row, SetErrors, Status
+from mor_bench.results.row import Row, ScaledBound, SetErrors, Status
 from mor_bench.runs.cached_fit import FitRecord
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.training_options import TrainingOptions
@@ -68,6 +69,19 @@ def failed_set(n: int, seed: int) -> SetErrors:
     """Return the errors of a method without any prediction on a test set: all are infinite."""
     worst = dict.fromkeys(("mean_dof_m", "rel_l2_median", "rel_l2_p95", "rel_l2_max"), np.inf)
     return SetErrors(seed=seed, n=n, n_failed=n, n_flagged=None, **worst)
+
+
+def scaled_bound(bound: ErrorBound, tests: Mapping[str, Score]) -> ScaledBound | None:
+    """Return the bound that follows an ensemble's spread, on each test set; None without spread."""
+    if bound.per_spread is None:
+        return None
+    known = np.isfinite(bound.per_spread)
+    widths = {n: bound.per_spread * float(np.median(s["spread"])) for n, s in tests.items()}
+    return ScaledBound(
+        per_spread=bound.per_spread,
+        widths=widths if known else {},
+        coverage=covered(bound, tests, scaled=True),
+    )
 
 
 def training_record(record: FitRecord, options: TrainingOptions | None) -> TrainingRecord | None:

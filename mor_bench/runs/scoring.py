@@ -82,6 +82,7 @@ class _Scorer:
         errors: list[SampleErrors] = []
         derived: list[dict[str, NDArray[np.float64]]] = []
         flags: list[bool] | None = []
+        spreads: list[float] | None = []
         data, worst = self.cached.data, _Worst(test)
         is_main = test is data.sets.get("test")
         indicated = Indicated(data.indicator if is_main else None, len(test.forces))
@@ -101,6 +102,8 @@ class _Scorer:
                 indicated.add(start, forces, predicted)
                 found = self.worker.ask("flag", LOAD_LIMIT_S, **test.queries(chunk))["flagged"]
                 flags = None if found is None or flags is None else flags + found
+                found = self.worker.ask("spread", left_s, **test.queries(chunk))["spread"]
+                spreads = None if found is None or spreads is None else spreads + found
             score: Score = {
                 name: np.concatenate([getattr(part, name) for part in errors]) for name in ERRORS
             }
@@ -111,6 +114,12 @@ class _Scorer:
             again = self._predictions(test, one, left_s, Path(folder) / "answers.npy")[0]
         if flags is not None:
             score["flagged"] = np.asarray(flags, dtype=bool)
+        if spreads is not None:
+            if len(spreads) != len(test.forces):
+                raise MethodFailedError(
+                    f"the method gave {len(spreads)} spreads for {len(test.forces)} loads"
+                )
+            score["spread"] = np.asarray(spreads, dtype=np.float64)
         has_forces = data.scene.observed_nodes is None
         return {
             **score,

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from mor_bench.counting import count
 from mor_bench.learning.perceptron import (
@@ -19,10 +19,12 @@ from mor_bench.learning.perceptron import (
     evaluate,
     named,
     named_shapes,
+    silu,
     slope_at_rest,
     taken,
 )
 from mor_bench.learning.training_plan import Loss
+from mor_bench.mechanics.compliance import project
 from mor_bench.model_file import fitting_arrays, weights_to_start_from
 from mor_bench.reduction.coordinates import change_of_basis
 from mor_bench.surrogates.coordinate_regression import Array, CoordinateSamples, Input
@@ -67,10 +69,15 @@ class PODNN(NetworkRegression):
     iterations: Annotated[int, Field(ge=1)] = 6000
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
-    architecture: ClassVar = ("input", "n_hidden")
+    architecture: ClassVar[tuple[str, ...]] = ("input", "n_hidden")
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the networks."""
+        return ["network"]
 
     def networks(self, n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, int, int]]:
-        return {"network": (n_inputs, self.n_hidden, n_outputs)}
+        return dict.fromkeys(self.names, (n_inputs, self.n_hidden, n_outputs))
 
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         scale = float(np.sqrt((samples.values**2).sum(axis=1).mean()))
@@ -83,22 +90,28 @@ class PODNN(NetworkRegression):
             arrays |= {"directions": samples.directions, "slopes": samples.slopes / scale}
         data = self.on_device(arrays)
         generator = torch.Generator().manual_seed(self.seed)
-        network = Perceptron(samples.z.shape[1], self.n_hidden, samples.values.shape[1], generator)
+        sizes = self.networks(samples.z.shape[1], samples.values.shape[1])
+        members = {name: Perceptron(*shape, generator) for name, shape in sizes.items()}
         if self.training.start_from is not None:
-            network.take(self._weights_of(self.training.start_from, scale))
-        network.to(data["inputs"].device)
-        known = self.train(network, self._loss(network, data), data, generator)
-        weights = network.arrays()
-        weights[-1] *= scale
-        return {**known, **named("network", weights)}
+            for name, member in members.items():
+                member.take(self._weights_of(self.training.start_from, name, scale))
+        networks = nn.ModuleList(members.values()).to(data["inputs"].device)
+        losses = [self._loss(member, data) for member in members.values()]
+        # Adam steps each weight alone, so a step on the sum is a step of every member.
+        known = self.train(networks, lambda rows: _sum(f(rows) for f in losses), data, generator)
+        for name, member in members.items():
+            weights = member.arrays()
+            weights[-1] *= scale
+            known |= named(name, weights)
+        return known
 
-    def _weights_of(self, path: Path, scale: float) -> list[Array]:
-        """Return the weights of a model of the same mesh, converted to the samples' bases."""
+    def _weights_of(self, path: Path, name: str, scale: float) -> list[Array]:
+        """Return a network of a model of the same mesh, converted to the samples' bases."""
         found, shape = weights_to_start_from(path, self), (len(self.axes_), None)
         bases = fitting_arrays(path, found, {"axes": shape, "modes": shape}, np.float64)
         axes, modes = bases["axes"], bases["modes"]
-        shapes = named_shapes("network", axes.shape[1], self.n_hidden, modes.shape[1])
-        first, *between, last = taken(fitting_arrays(path, found, shapes, np.float64), "network")
+        shapes = named_shapes(name, axes.shape[1], self.n_hidden, modes.shape[1])
+        first, *between, last = taken(fitting_arrays(path, found, shapes, np.float64), name)
         return [
             change_of_basis(axes, self.axes_) @ first,
             *between,
@@ -133,7 +146,7 @@ class PODNN(NetworkRegression):
         super().take(model)
         self._slope: Array | None = None
         if self.input == "linear-response":
-            self._slope = slope_at_rest(self.networks_["network"])
+            self._slope = np.mean([slope_at_rest(w) for w in self.networks_.values()], axis=0)
 
     def values(self, z: Array) -> Array:
         return evaluate(self.networks_["network"], z)
@@ -144,3 +157,84 @@ class PODNN(NetworkRegression):
             count(multiply_adds=len(z) * self._slope.size)
             out -= z @ self._slope
         return out
+
+
+@dataclass(eq=False)
+class PODNNEnsemble(PODNN):
+    """The mean of several `PODNN` that differ in their initial weights.
+
+    Lakshminarayanan, Pritzel, Blundell: Simple and scalable predictive uncertainty estimation using
+    deep ensembles, NeurIPS 2017. All members train on the same batches.
+
+    Parameters
+    ----------
+    n_members : int
+        Networks, 2 to 32.
+    """
+
+    n_members: Annotated[int, Field(ge=2, le=32)] = 5
+
+    architecture: ClassVar = ("input", "n_hidden", "n_members")
+
+    @property
+    def names(self) -> list[str]:
+        return [f"network_{i}" for i in range(self.n_members)]
+
+    def take(self, model: dict[str, NDArray[Any]]) -> None:
+        members = [taken(model, name) for name in self.names]
+        first, first_bias, second, second_bias, last = (
+            np.stack(parts) for parts in zip(*members, strict=True)
+        )
+        n_inputs, n_outputs = first.shape[1], last.shape[2]
+        self._first = first.transpose(1, 0, 2).reshape(n_inputs, -1), first_bias.ravel()
+        self._second = second, second_bias[:, None]
+        self._last, self._mean_last = last, last.reshape(-1, n_outputs) / self.n_members
+        super().take(model)
+
+    def values(self, z: Array) -> Array:
+        hidden = self._hidden(z).transpose(1, 0, 2)
+        out: Array = hidden.reshape(len(z), -1) @ self._mean_last
+        return out
+
+    def spread(self, forces: ArrayLike) -> Array:
+        """Return how much the members disagree, relative to the prediction, of shape () or (n,).
+
+        It is the root mean square over the members of the norm of their deviation from the mean,
+        divided by the norm of the mean; zero for a prediction of zero. It is no bound of an error:
+        `mor_bench.error_bound` finds the factor that makes it one.
+
+        Parameters
+        ----------
+        forces : (n_nodes, 3) or (n, n_nodes, 3), or ObservedDisplacements
+            As in `predict`.
+
+        Raises
+        ------
+        InvalidInputError, NotFittedError
+            As in `predict`.
+        """
+        given = self._checked(forces).values
+        loads = given.reshape(len(given), -1)
+        z = project(self.from_forces_, self.response_.respond(loads) if self._kinked else loads)
+        members = (self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last
+        if self._slope is not None:
+            members -= z @ np.array([slope_at_rest(w) for w in self.networks_.values()])
+        away = members - members.mean(axis=0)
+        gram = self._expanding @ self._expanding.T
+        squared = np.einsum("mnr,rs,mns->n", away, gram, away, optimize=True) / len(away)
+        norms = np.linalg.norm(np.nan_to_num(self.answer(given)), axis=(1, 2))
+        relative = np.sqrt(squared) / np.where(norms > 0, norms, np.inf)
+        return np.asarray(relative.reshape(np.shape(forces)[:-2]))
+
+    def _hidden(self, z: Array) -> Array:
+        """Return the last hidden layers at z (n, n_inputs), (n_members, n, n_hidden)."""
+        (first, first_bias), (second, second_bias) = self._first, self._second
+        x = silu(z @ first + first_bias).reshape(len(z), self.n_members, -1)
+        return silu(x.transpose(1, 0, 2) @ second + second_bias)
+
+
+def _sum(losses: Iterable[Tensor]) -> Tensor:
+    first, *others = losses
+    for other in others:
+        first = first + other
+    return first
