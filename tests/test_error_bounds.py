@@ -88,6 +88,61 @@ def test_a_fitted_method_is_calibrated_on_samples_that_it_has_not_seen(tiny: Dat
     assert errors.min() < bound.relative_l2 <= errors.max()
 
 
+def test_scaled_bounds_hold_for_new_groups_and_follow_the_spread() -> None:
+    """Errors proportional to the spread: the bound is as narrow as their proportion allows."""
+    generator = np.random.default_rng(5)
+    regions = np.repeat(np.arange(40), 10)
+    hits, widths, constant, trials = 0.0, 0.0, 0.0, 300
+    for _ in range(trials):
+        spreads = generator.lognormal(sigma=1.5, size=(41, 1)) * np.ones(10)
+        errors = spreads * generator.uniform(0.5, 1.0, size=spreads.shape)
+        bound = calibrated(errors[:40].ravel(), regions, 0.9, spreads[:40].ravel())
+        assert bound.per_spread is not None
+        hits += float((errors[40] <= bound.per_spread * spreads[40]).mean())
+        widths += float(np.mean(bound.per_spread * spreads[40]))
+        constant += bound.relative_l2
+    assert 0.9 <= hits / trials <= 0.99
+    assert widths < 0.6 * constant
+
+
+def test_spreads_of_zero_bound_only_errors_of_zero() -> None:
+    zeros = np.zeros(20)
+    assert calibrated(zeros, None, 0.9, zeros).per_spread == 0.0
+    assert calibrated(np.ones(20), None, 0.9, zeros).per_spread == np.inf
+    assert calibrated(np.ones(20), None, 0.9).per_spread is None
+
+
+def test_an_ensemble_gives_each_load_its_own_bound(tiny: Dataset) -> None:
+    pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
+    method: Any = mor_bench.load_method("pod-nn-ensemble", iterations=200, n_hidden=16)
+    method.fit(tiny.scene, tiny.train)
+    bound = mor_bench.error_bound(method, tiny.validation, level=0.5)
+    forces = tiny.test.forces
+    predicted, spread = method.predict(forces), method.spread(forces)
+    assert spread.shape == (len(forces),)
+    assert method.spread(forces[0]) == pytest.approx(spread[0])
+    assert method.spread(0.0 * forces[0]) == 0.0
+    assert bound.per_spread is not None
+    share = bound.per_spread * spread
+    expected = share / (1 - share) * np.linalg.norm(predicted, axis=(1, 2))
+    assert (share < 1).all()
+    np.testing.assert_allclose(bound.of_prediction(predicted, spread), expected)
+    assert len(set(expected)) == len(forces)
+    scores = {
+        "test": {
+            "relative_l2": np.linalg.norm(predicted - tiny.test.displacements, axis=(1, 2))
+            / np.linalg.norm(tiny.test.displacements, axis=(1, 2)),
+            "spread": spread,
+        }
+    }
+    within = (scores["test"]["relative_l2"] <= share).mean()
+    assert covered(bound, scores, scaled=True) == {"test": within}
+    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+    constant = mor_bench.error_bound(linear, tiny.validation, level=0.5)
+    with pytest.raises(InvalidInputError, match="`spread` must be left out"):
+        constant.of_prediction(predicted, spread)
+
+
 def test_only_wanted_nodes_count(tiny: Dataset) -> None:
     """The bound of a method that leaves out the other nodes is that of one that does not."""
     needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max"})

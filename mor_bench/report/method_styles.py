@@ -150,6 +150,7 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
             "autoencoder",
             "pod-nn-derivative",
             "pod-nn-force",
+            "pod-nn-ensemble",
         ),
     ),
     "neural operators and graphs": (

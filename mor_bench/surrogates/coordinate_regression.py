@@ -226,6 +226,17 @@ class CoordinateRegression(Surrogate, ABC):
             out += self._added(loads)
         return at_wanted(out, self._wanted, loads.shape[1]).reshape(forces.shape)
 
+    def inputs_of(self, forces: Array) -> Array:
+        """Return the inputs z (n, n_inputs) of g under checked forces (n, n_nodes, 3)."""
+        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
+        return project(self.from_forces_, self.response_.respond(loads) if self._kinked else loads)
+
+    def norms_of(self, coefficients: Array) -> Array:
+        """Return the norms of Φ g at the wanted nodes, m, from coefficients g (…, n_outputs)."""
+        gram = self._expanding @ self._expanding.T
+        squared = ((coefficients @ gram) * coefficients).sum(axis=-1)
+        return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+
     def _added(self, loads: Array) -> Array:
         """Return the linear response at the wanted dofs; ``loads`` is it where it is kinked."""
         if self._respond_at is not None:

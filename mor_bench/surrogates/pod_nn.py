@@ -24,9 +24,9 @@ from mor_bench.learning.perceptron import (
     taken,
 )
 from mor_bench.learning.training_plan import Loss
-from mor_bench.mechanics.compliance import project
 from mor_bench.model_file import fitting_arrays, weights_to_start_from
 from mor_bench.reduction.coordinates import change_of_basis
+from mor_bench.snapshots.given import checked_given
 from mor_bench.surrogates.coordinate_regression import Array, CoordinateSamples, Input
 from mor_bench.surrogates.network_regression import NetworkRegression
 
@@ -213,16 +213,13 @@ class PODNNEnsemble(PODNN):
         InvalidInputError, NotFittedError
             As in `predict`.
         """
-        given = self._checked(forces).values
-        loads = given.reshape(len(given), -1)
-        z = project(self.from_forces_, self.response_.respond(loads) if self._kinked else loads)
+        predicted = np.nan_to_num(self.predict(forces))
+        z = self.inputs_of(checked_given(self.scene_, forces).values)
         members = (self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last
         if self._slope is not None:
             members -= z @ np.array([slope_at_rest(w) for w in self.networks_.values()])
-        away = members - members.mean(axis=0)
-        gram = self._expanding @ self._expanding.T
-        squared = np.einsum("mnr,rs,mns->n", away, gram, away, optimize=True) / len(away)
-        norms = np.linalg.norm(np.nan_to_num(self.answer(given)), axis=(1, 2))
+        squared = (self.norms_of(members - members.mean(axis=0)) ** 2).mean(axis=0)
+        norms = np.linalg.norm(predicted.reshape(len(z), -1), axis=1)
         relative = np.sqrt(squared) / np.where(norms > 0, norms, np.inf)
         return np.asarray(relative.reshape(np.shape(forces)[:-2]))
 
