@@ -193,7 +193,7 @@ class PODNNEnsemble(PODNN):
 
     def values(self, z: Array) -> Array:
         hidden = self._hidden(z).transpose(1, 0, 2)
-        out: Array = hidden.reshape(len(z), -1) @ self._mean_last
+        out: Array = hidden.reshape(len(z), len(self._mean_last)) @ self._mean_last
         return out
 
     def spread(self, forces: ArrayLike) -> Array:
@@ -226,7 +226,7 @@ class PODNNEnsemble(PODNN):
     def _hidden(self, z: Array) -> Array:
         """Return the last hidden layers at z (n, n_inputs), (n_members, n, n_hidden)."""
         (first, first_bias), (second, second_bias) = self._first, self._second
-        x = silu(z @ first + first_bias).reshape(len(z), self.n_members, -1)
+        x = silu(z @ first + first_bias).reshape(len(z), self.n_members, self.n_hidden)
         return silu(x.transpose(1, 0, 2) @ second + second_bias)
 
 
