@@ -19,7 +19,6 @@ from mor_bench.mechanics.moved_bodies import ToolForces
 from mor_bench.report.scene_text import scene_text
 from mor_bench.report.suite_overview import dataset_family
 from mor_bench.runs.file_check import check_file
-from mor_bench.scene.scene import load_scene
 from mor_bench.scene.symmetry import mirrors
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.given import ObservedDisplacements
@@ -130,22 +129,6 @@ def test_motions_fill_a_cone() -> None:
     straight = draw_loads(block(), 0, 5).vectors[:, 0]
     assert not straight[:, :2].any()
     assert (straight[:, 2] < 0).all()
-
-
-def test_an_instrument_moves_against_the_nearest_part_of_the_surface_by_default() -> None:
-    table = content(loads=LOADS)
-    del table["loads"]["direction"]
-    scene, expected = load_scene(table), block(loads=LOADS)
-    np.testing.assert_array_equal(
-        draw_loads(scene, 0, 9).vectors, draw_loads(expected, 0, 9).vectors
-    )
-    assert "direction" not in scene.generated.physics()["loads"]
-    beside = {"sphere": {"radius_m": 0.3, "centre_m": [1.35, 0.4, 0.3]}}
-    loads = {"region": "surface", "instrument": beside, "magnitude_m": [0.06, 0.1]}
-    del (table := content(loads=loads))["loads"]["direction"]
-    drawn = draw_loads(load_scene(table), 0, 5).vectors[:, 0]
-    assert (drawn[:, 0] < 0).all()
-    assert np.abs(drawn[:, 1:]).max() < 1e-12
 
 
 def test_methods_get_the_motion_of_the_instrument(data: Dataset) -> None:

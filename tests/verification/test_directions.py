@@ -1,4 +1,4 @@
-"""Directions of supports: what they hold on a mesh and on finer ones, and refusals."""
+"""Directions of supports and of instruments: what they mean on meshes, and refusals."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ from mor_bench.errors import SpecError, UnconstrainedBodyError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.other_meshes import refined
 from mor_bench.scene.scene import load_scene
+from mor_bench.snapshots.sampling import draw_loads
 
 from .oblique import ROTATION, SPEC, turned
+from .pressed_blocks import block, content
+
+SPREAD: dict[str, Any] = {"spread_deg": 40.0, "samples": 60, "sampling": "sobol", "seed": 3}
 
 
 def test_directions_along_an_axis_are_components() -> None:
@@ -89,3 +93,19 @@ def test_other_scenes_keep_their_digest_and_have_no_frames() -> None:
     scene = mor_bench.load_scene("beam-tiny")
     assert scene.frames is None
     assert "direction" not in str(scene.spec.physics())
+
+
+def test_an_instrument_moves_against_the_nearest_part_of_the_surface_by_default() -> None:
+    table = content(loads=SPREAD)
+    del table["loads"]["direction"]
+    scene, expected = load_scene(table), block(loads=SPREAD)
+    np.testing.assert_array_equal(
+        draw_loads(scene, 0, 9).vectors, draw_loads(expected, 0, 9).vectors
+    )
+    assert "direction" not in scene.generated.physics()["loads"]
+    beside = {"sphere": {"radius_m": 0.3, "centre_m": [1.35, 0.4, 0.3]}}
+    loads = {"region": "surface", "instrument": beside, "magnitude_m": [0.06, 0.1]}
+    del (table := content(loads=loads))["loads"]["direction"]
+    drawn = draw_loads(load_scene(table), 0, 5).vectors[:, 0]
+    assert (drawn[:, 0] < 0).all()
+    assert np.abs(drawn[:, 1:]).max() < 1e-12
