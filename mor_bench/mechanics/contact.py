@@ -283,8 +283,18 @@ class ContactModel(FullOrderModel):
     def _solved(self, given: Array, options: NewtonOptions) -> Solution | SolverError:
         self.prepare()  # what copies share
         motion = motion_of(self.scene, given)
-        first = self._contact.points.first_step(motion)
-        return solve_contact(self, motion, first, options)
+        points = self._contact.points
+        found = solve_contact(self, motion, points.first_step(motion), options)
+        if isinstance(found, Solution):
+            moved = self.scene.at_all_dofs(found.displacement[None]).reshape(-1, 3)
+            depth, allowed = points.depth_of_nodes(moved, motion), points.surface.deepest_m
+            if depth > allowed:
+                return NoEquilibriumError(
+                    f"no valid equilibrium found: a node lies {depth:.3g} m deep in the "
+                    f"instrument, more than {allowed:.3g} m, so the body has passed through it.",
+                    cuts=found.cuts,
+                )
+        return found
 
 
 def penetrations(scene: Scene, displacements: Array, motions: Array) -> Array:

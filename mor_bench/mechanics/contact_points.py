@@ -92,6 +92,8 @@ class ContactPoints:
         self.surface: ContactSurface = scene.contact_surface
         surface, self._instrument = self.surface, self.surface.instrument
         self._points, rest = surface.points, rest_displacement(scene)
+        self._nodes = scene.mesh.points if rest is None else scene.mesh.points + rest
+        self._outside = self._instrument.gaps(self._nodes)[0] >= 0
         if rest is not None:
             self._points = surface.points + surface.values @ rest
             deepest = -float(self._instrument.gaps(self._points)[0].min())
@@ -115,6 +117,14 @@ class ContactPoints:
         forces = (stiffness * depth)[:, None] * normals
         energy = 0.5 * float(stiffness @ depth**2)
         return Touch(points, forces, energy, depth, normals, curvatures[points], stiffness)
+
+    def depth_of_nodes(self, displacements: Array, motion: Array) -> float:
+        """Return how deep a node is in the instrument that is outside at rest, m; 0 if none is.
+
+        All nodes count, not only those that it may touch. Arguments as in `touch`, for all nodes.
+        """
+        gaps = self._instrument.gaps(self._nodes + (displacements - motion))[0]
+        return float(np.maximum(-gaps[self._outside], 0.0).max(initial=0.0))
 
     def normals(self, moved: Array, motion: Array) -> Array:
         """Return the instrument's normals (n, 3) at points that moved by (n, 3), m."""

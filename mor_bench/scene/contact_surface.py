@@ -124,6 +124,9 @@ class ContactSurface:
         The penalty stiffness, N/m³.
     axis : (3,) float64
         Unit vector in the middle of the instrument's motions.
+    deepest_m : float
+        Depth of a node in the instrument that no contact explains, m: the size of a facet. Nodes
+        outside a smooth surface may be as far again from it.
     """
 
     instrument: Instrument
@@ -132,6 +135,7 @@ class ContactSurface:
     stiffness: Array
     penalty_n_m3: float
     axis: Array
+    deepest_m: float
 
     @property
     def gaps_at_rest(self) -> Array:
@@ -200,7 +204,10 @@ def contact_surface(
     else:
         values = interpolation_matrix(mesh, points)
     axis = unit(plan.direction or (-vectors[instrument.gaps(points)[0].argmin()]).tolist())
-    return ContactSurface(instrument, points, values, penalty * areas, float(penalty), axis)
+    deepest = size if surface.points is mesh.points else 2.0 * size
+    return ContactSurface(
+        instrument, points, values, penalty * areas, float(penalty), axis, deepest
+    )
 
 
 def _misplaced(plan: Contact, instrument: Instrument, points: Array) -> list[str]:

@@ -240,11 +240,12 @@ def _real_numbers(n_nodes: int, given: ArrayLike, name: str) -> NDArray[Any]:
 
 
 def _in_range(array: NDArray[Any], name: str, unit: str) -> NDArray[np.float64]:
-    if array.size and not np.abs(array).max() <= MAX_FORCE_N:  # NaN compares as false
-        raise InvalidInputError(
-            f"{name} must be finite and at most {MAX_FORCE_N:g} {unit}; "
-            f"got {np.abs(array).max():g}."
-        )
     if array.dtype != np.float64:
         array = array.astype(np.float64)
+    flat = array.ravel()
+    # The sum of squares takes a tenth of the time of the largest magnitude, and proves most values.
+    if not flat @ flat <= MAX_FORCE_N and not np.abs(flat).max() <= MAX_FORCE_N:  # also for NaN
+        raise InvalidInputError(
+            f"{name} must be finite and at most {MAX_FORCE_N:g} {unit}; got {np.abs(flat).max():g}."
+        )
     return array[None] if array.ndim == 2 else array

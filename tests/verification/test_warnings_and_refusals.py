@@ -11,14 +11,23 @@ import pytest
 from numpy.typing import NDArray
 
 import mor_bench
-from mor_bench.errors import IllConditionedWarning, InvalidInputError, LockingWarning, SpecError
+from mor_bench.errors import (
+    IllConditionedWarning,
+    InvalidInputError,
+    LockingWarning,
+    NoEquilibriumError,
+    SpecError,
+)
 from mor_bench.hard_cases.setups import free_assembler
+from mor_bench.mechanics.contact import ContactModel
+from mor_bench.mechanics.contact_points import ContactPoints
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.runs.file_check import check_file
 from mor_bench.scene.mesh import Mesh
 
 from .laws_and_elements import ELEMENTS, LAWS
+from .pressed_blocks import block, given
 from .scenes import scene_of
 
 
@@ -121,3 +130,20 @@ def test_solvers_and_tolerances_that_do_not_exist_are_refused(solver: str) -> No
     for tolerance in (0.0, -1.0, 2.0, float("nan")):
         with pytest.raises(InvalidInputError, match=r"`tolerance` must be in \(0, 1\]"):
             NewtonOptions(tolerance)
+
+
+def test_a_body_that_has_passed_through_an_instrument_is_refused() -> None:
+    """The block folds through its own base. Its sides then lie far behind the plate."""
+    scene = block(
+        {"plane": {"point_m": [0.0, 0.0, 2.01], "normal": [0.0, 0.0, -1.0]}},
+        geometry={"shape": "box", "size_m": [2.0, 2.0, 2.0], "cells": [4, 4, 4]},
+        loads={"magnitude_m": [0.0, 1.3]},
+    )
+    model, points = ContactModel(scene), ContactPoints(scene)
+    motion = given(scene, [0.0, 0.0, -1.2]).ravel()[scene.free_dofs]
+    with pytest.raises(NoEquilibriumError, match=r"0\.89 m deep in the instrument, more than 0\.5"):
+        model.solve(motion)
+    found = model.solve(0.5 * motion).displacement
+    moved = scene.at_all_dofs(found[None]).reshape(-1, 3)
+    assert points.depth_of_nodes(moved, np.array([0.0, 0.0, -0.6])) < 0.002
+    assert points.depth_of_nodes(0.0 * moved, np.array([0.0, 0.0, -0.6])) == pytest.approx(0.59)
