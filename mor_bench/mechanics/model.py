@@ -88,6 +88,11 @@ def missing_library(solver: SolverName) -> str | None:
     return None
 
 
+SYMMETRIC_PART = (
+    "Constant pressures that follow the surface are solved for with the symmetric part of the "
+    "tangent, which may refuse states that a sampled one in `[loads]` reaches with the whole."
+)
+
 _BODIES = "an instrument presses bodies that vary between samples"
 
 
@@ -140,7 +145,10 @@ def rest_displacement(scene: Scene) -> NDArray[np.float64] | None:
                 "constant pressures": scene.constant_pressures,
             }
             acting = " and ".join(name for name, given in causes.items() if given)
-            raise SolverError(f"{scene.name}: no rest state under {acting}: {error}") from None
+            text = f"{scene.name}: no rest state under {acting}: {error}"
+            if followers_of(scene.constant_pressures):
+                text = f"{text} {SYMMETRIC_PART}"
+            raise SolverError(text) from None
         scene.memo["rest"] = found
     return scene.memo["rest"].reshape(-1, 3)
 

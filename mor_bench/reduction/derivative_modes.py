@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
+from mor_bench.specs.load_ranges import largest_of
 
 DIFFERENCE = 1e-3
 """Largest displacement of the finite differences, relative to the body.
@@ -60,7 +61,7 @@ def linear_modes(scene: Scene, model: FullOrderModel, n_modes: int | None = None
     responses = patch_responses(scene, model)
     basis = pod(responses, n_modes)
     # A random direction has a mean square of 1/3 along each axis.
-    size = scene.generated.load_plan.magnitude[1] / np.sqrt(len(responses))
+    size = largest_of(scene.generated.load_plan.magnitude) / np.sqrt(len(responses))
     return LinearModes(basis.modes, size * basis.singular_values[: basis.modes.shape[1]])
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mor_bench.reduction.derivative_modes import patch_forces
 from mor_bench.scene.scene import Scene
+from mor_bench.specs.load_ranges import largest_of
 
 Array = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ def load_grid(scene: Scene, n_rings: int, n_magnitudes: int) -> LoadGrid:
     sizes, parts = interval_rule(n_magnitudes)
     on_patches = patch_forces(scene)
     forces = on_patches.reshape(3, -1, on_patches.shape[1]).transpose(1, 0, 2)
-    largest = scene.generated.load_plan.magnitude[1]
+    largest = largest_of(scene.generated.load_plan.magnitude)
     return LoadGrid(
         np.ascontiguousarray(forces), directions, largest * sizes, shares[:, None] * parts
     )

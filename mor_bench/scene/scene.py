@@ -280,7 +280,7 @@ class Scene:
     @cached_property
     def patch_scales(self) -> NDArray[np.float64]:
         """(n_patches,) largest load of each patch, relative to the largest of all tables."""
-        ends = np.array([acting.plan.magnitude[1] for acting in self.acting])
+        ends = np.array([np.abs(acting.plan.magnitude).max() for acting in self.acting])
         numbers = [1] if self.contact else [len(acting.nodes) for acting in self.acting]
         return np.repeat(ends / ends.max(), numbers)
 

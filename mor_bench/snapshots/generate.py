@@ -32,6 +32,7 @@ from mor_bench.snapshots.store import (
     write_shard,
 )
 from mor_bench.specs import DatasetSpec
+from mor_bench.specs.load_ranges import largest_of
 
 SHARD_SIZE = 100
 """Samples per shard."""
@@ -161,7 +162,7 @@ class ShardPlan:
         )
 
     def _is_loaded(self, shard: Shard, loads: PatchLoads) -> bool:
-        largest = self.scene.generated.load_plan.magnitude[1]
+        largest = largest_of(self.scene.generated.load_plan.magnitude)
         return bool(
             shard.patches.shape == loads.patches.shape
             and shard.vectors.shape == loads.vectors.shape

@@ -7,6 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
+from scipy.linalg.blas import ddot
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene
@@ -244,7 +245,8 @@ def _in_range(array: NDArray[Any], name: str, unit: str) -> NDArray[np.float64]:
         array = array.astype(np.float64)
     flat = array.ravel()
     # The sum of squares takes a tenth of the time of the largest magnitude, and proves most values.
-    if not flat @ flat <= MAX_FORCE_N and not np.abs(flat).max() <= MAX_FORCE_N:  # also for NaN
+    # NaN compares as false.
+    if flat.size and not ddot(flat, flat) <= MAX_FORCE_N and not np.abs(flat).max() <= MAX_FORCE_N:
         raise InvalidInputError(
             f"{name} must be finite and at most {MAX_FORCE_N:g} {unit}; got {np.abs(flat).max():g}."
         )

@@ -17,6 +17,7 @@ from mor_bench.specs.base import (
 )
 from mor_bench.specs.instrument_spec import Direction, Instrument
 from mor_bench.specs.load_ranges import SEED_STEP, AtOnce, LoadKind, Magnitude, Sampling, Steps
+from mor_bench.specs.pressure_range import PressureRange
 from mor_bench.specs.region_spec import Region
 
 
@@ -194,10 +195,9 @@ class Pressure(StrictModel):
     regions : list of Region
         The facets with all corners in a region are pressed.
     follower : bool
-        Whether the pressures act on the deformed surface, along its normals. If not, they are dead
-        loads along the normals of the undeformed body. Default: false.
+        Whether the pressures act on the deformed surface, along its normals. Default: false.
     magnitude_pa : two floats
-        Range of each pressure, Pa. It pushes into the body.
+        Range of each pressure, Pa. It pushes into the body; a negative one pulls.
     samples : int
         Number of samples.
     sampling : str
@@ -214,7 +214,7 @@ class Pressure(StrictModel):
     regions: Annotated[tuple[Region, ...], Field(strict=False, min_length=1, max_length=8)]
     kind: Literal["pressure"]
     samples: Count
-    magnitude_pa: Magnitude
+    magnitude_pa: PressureRange
     follower: bool = False
     sampling: Sampling = "random"
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0

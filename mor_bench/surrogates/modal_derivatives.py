@@ -18,6 +18,7 @@ from mor_bench.reduction.static_correction import predict_corrected
 from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.specs.load_ranges import largest_of
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.free_dofs import answer_each, galerkin_or_polynomial
 
@@ -58,7 +59,9 @@ class ModalDerivatives(Surrogate):
         modes = derivative_basis(scene, full, self.n_linear, self.n_modes)
         if not polynomial_pays(full, modes.shape[1]):
             return {"modes": modes}
-        largest = scene.generated.load_plan.magnitude[1] * patch_responses(scene, full) @ modes
+        largest = (
+            largest_of(scene.generated.load_plan.magnitude) * patch_responses(scene, full) @ modes
+        )
         chosen = np.unique(np.linspace(0, len(largest) - 1, N_WATCHED // 2).astype(int))
         watched = np.vstack([largest[chosen], -largest[chosen]])
         return {"modes": modes, **TensorProblem.of_modes(full, modes, watched).arrays}

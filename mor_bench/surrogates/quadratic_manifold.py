@@ -24,6 +24,7 @@ from mor_bench.reduction.static_correction import refuse_inverted, static_correc
 from mor_bench.reduction.weighted_cells import weighted_cells
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.specs.load_ranges import largest_of
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.free_dofs import answer_each
 
@@ -116,7 +117,7 @@ def _states_under_loads(model: FullOrderModel, manifold: QuadraticManifold) -> l
     scene, rng = model.scene, np.random.default_rng(0)
     linear = GalerkinProblem(model.assembler, manifold.modes)
     on_nodes = scene.patch_weights.toarray() * scene.patch_scales[:, None]
-    largest = scene.generated.load_plan.magnitude[1]
+    largest = largest_of(scene.generated.load_plan.magnitude)
     chosen = np.linspace(0, len(on_nodes) - 1, N_CUBATURE_LOADS).round().astype(int)
     vectors = rng.normal(size=(len(chosen), 3))
     vectors *= (

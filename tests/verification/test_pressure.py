@@ -22,6 +22,7 @@ from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.snapshots.test_sets import available_sets, spec_of_set
 from mor_bench.specs import load_generated_spec
+from mor_bench.specs.load_ranges import largest_of
 
 from .scenes import reactions
 
@@ -170,6 +171,26 @@ def test_every_sample_presses_each_region_with_a_pressure_in_range(sampling: str
     )
     later = draw_loads(scene, 25, 40)
     np.testing.assert_array_equal(later.vectors, drawn.vectors[25:])
+
+
+def test_sampled_pressures_may_pull() -> None:
+    """Suction stretches the bar as the opposite pressure compresses it in linear elasticity."""
+    scene = pressed(loads={**LOADS, "magnitude_pa": [-20.0, 0.0], "sampling": "sobol"})
+    drawn = draw_loads(scene, 0, 40)
+    pressures = -drawn.vectors[:, 0, 0]
+    assert -20.0 <= pressures.min() < -19.0
+    assert -1.0 < pressures.max() <= 0.0
+    assert spec_of_set(scene.generated, "2x").load_plan.magnitude == (-40.0, 0.0)
+    assert largest_of(scene.generated.load_plan.magnitude) == 20.0
+    linear = mor_bench.load_method("linear-fem").fit(scene)
+    pulled = linear.predict(forces_of(scene, -20.0))
+    np.testing.assert_allclose(pulled, -linear.predict(forces_of(scene, 20.0)), rtol=1e-9)
+    assert pulled[:, 0].max() > 0
+    stretched = solved(scene, forces_of(scene, -20.0))
+    np.testing.assert_allclose(stretched, pulled, atol=0.1 * np.abs(pulled).max())
+    for wrong in ([-2e12, 0.0], [0.0, 0.0], [1.0, -1.0]):
+        with pytest.raises(SpecError, match="magnitude_pa"):
+            pressed(loads={**LOADS, "magnitude_pa": wrong})
 
 
 def test_named_sets_and_the_discretisation_error_exist(tmp_path: Path) -> None:
