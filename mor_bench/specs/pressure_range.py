@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import AfterValidator, Field, FiniteFloat
+from pydantic import AfterValidator, Field
 
+from mor_bench.specs.base import Finite
 from mor_bench.specs.load_ranges import LEAST, MOST, largest_of, ordered
 
 
@@ -16,7 +17,7 @@ def _of_size(value: tuple[float, float]) -> tuple[float, float]:
 
 
 PressureRange = Annotated[
-    tuple[FiniteFloat, FiniteFloat],
+    tuple[Finite, Finite],
     Field(strict=False),
     AfterValidator(ordered),
     AfterValidator(_of_size),

@@ -51,3 +51,25 @@ def _change(
     """Return both values, and the method of today's."""
     values = [DASH if row is None else number(scale * row[name]) for row in (before, now)]
     return " → ".join(values) + ("" if now is None else f" `{now['method']}`")
+
+
+FIGURES = {
+    "import_s": ("import, s", 1.0),
+    "fit_and_first_solve_s": ("fit and first solve, s", 1.0),
+    "solve_s": ("solve, ms", 1e3),
+    "memory_bytes": ("memory, MB", 1e-6),
+}
+
+
+def nothing_slower(source: str) -> str:
+    """Show start, memory and solves of the full-order model before and now, and their ratios."""
+    rows = content_of(source)["rows"]
+    body = []
+    for name in dict.fromkeys(row["dataset"] for row in rows):
+        of = {row["version"]: row for row in rows if row["dataset"] == name}
+        cells = [f"`{name}`"]
+        for figure, (_, unit) in FIGURES.items():
+            before, now = (unit * of[version][figure] for version in ("before", "now"))
+            cells.append(f"{number(before)} → {number(now)} ({now / before:.2f})")
+        body.append(cells)
+    return markdown(["scene", *(text for text, _ in FIGURES.values())], body)

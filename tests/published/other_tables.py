@@ -22,7 +22,7 @@ from tests.published.cost_tables import (
     probe_cost,
     scaling,
 )
-from tests.published.front_tables import fronts
+from tests.published.front_tables import fronts, nothing_slower
 from tests.published.literature_table import literature
 from tests.published.network_size_tables import (
     full_sizes,
@@ -37,6 +37,7 @@ from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.sampling_tables import learning_curves
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
+from tests.published.stress_tables import stresses
 from tests.published.training_curve_tables import training_iterations, training_samples
 
 
@@ -370,6 +371,8 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "network-sizes": network_sizes,
     "network-size-law": network_size_law,
     "fronts": fronts,
+    "nothing-slower": nothing_slower,
+    "stresses": stresses,
     "full-sizes": full_sizes,
     "training-speed": training_speed,
     "paper-size": paper_size,

@@ -42,7 +42,7 @@ def _percent(value: float) -> str:
     return percent(value) if isfinite(value) else "∞"
 
 
-def _rows(run: Comparison, dataset: str, methods: str) -> list[Row]:
+def rows_of(run: Comparison, dataset: str, methods: str) -> list[Row]:
     """Return the rows that ran, of one dataset and of the named methods in this order."""
     name = dataset or next(iter(run.datasets))
     rows = [row for row in run.rows if row.ok and row.dataset == name]
@@ -155,7 +155,7 @@ def selected(source: str, dataset: str = "", methods: str = "", by: str = "need"
     bounds = error_bounds(run, name)
     rows = [
         (sufficient(own, bounds, need) if by == "need" else None) or chosen(own, bounds)
-        for own in _by_method(_rows(run, dataset, methods)).values()
+        for own in _by_method(rows_of(run, dataset, methods)).values()
     ]
     headings = ["method", "is given", "selected", *ERRORS_SHOWN, "fresh test: median %", "ms"]
     headings += ["data + fit, core-s", "break-even without tuning, queries"]
@@ -183,7 +183,7 @@ def best_of_class(source: str, dataset: str = "") -> str:
     name = dataset or next(iter(run.datasets))
     need = float((run.datasets[name].get("needs") or {}).get("error", 0.01))
     bounds, by_class = error_bounds(run, name), dict[str, list[Row]]()
-    for row in _rows(run, name, ""):
+    for row in rows_of(run, name, ""):
         by_class.setdefault(class_text(row, given_by(run, name)), []).append(row)
     body = []
     for told, rows in by_class.items():
@@ -206,7 +206,7 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     name = dataset or next(iter(run.datasets))
     headings = ["method", "is given", *(f"≤ {number(100 * level)} %" for level in LEVELS)]
     body, bounds = [], error_bounds(run, name)
-    for method, rows in _by_method(_rows(run, dataset, methods)).items():
+    for method, rows in _by_method(rows_of(run, dataset, methods)).items():
         cells = [f"`{method}`", class_text(rows[0], given_by(run, name))]
         for level in LEVELS:
             best = sufficient(rows, bounds, level)
@@ -224,7 +224,7 @@ def named_sets(source: str, dataset: str = "", methods: str = "") -> str:
     run = run_of(source)
     name = dataset or next(iter(run.datasets))
     bounds = error_bounds(run, name)
-    rows = [chosen(mine, bounds) for mine in _by_method(_rows(run, dataset, methods)).values()]
+    rows = [chosen(mine, bounds) for mine in _by_method(rows_of(run, dataset, methods)).values()]
     names = list(dict.fromkeys(each for row in rows for each in row.sets))
     body = []
     for row in rows:
@@ -249,7 +249,7 @@ def covered(source: str) -> str:
     for run in map(run_of, source.split(",")):
         for name in run.datasets:
             bounds, given = error_bounds(run, name), given_by(run, name)
-            for method, mine in _by_method(_rows(run, name, "")).items():
+            for method, mine in _by_method(rows_of(run, name, "")).items():
                 row = chosen(mine, bounds)
                 found.setdefault((name, method), (row, class_text(row, given)))
     names = list(
@@ -292,7 +292,7 @@ def indicated(source: str, methods: str = "") -> str:
     names = [next(iter(run.datasets)) for run in runs]
     columns = []
     for run, name in zip(runs, names, strict=True):
-        bounds, mine = error_bounds(run, name), _by_method(_rows(run, "", methods))
+        bounds, mine = error_bounds(run, name), _by_method(rows_of(run, "", methods))
         columns.append({method: chosen(own, bounds) for method, own in mine.items()})
     body = []
     for method in columns[0]:
@@ -354,7 +354,7 @@ def _training(row: Row) -> tuple[str, str]:
 def facts(source: str, dataset: str = "") -> str:
     """State the settings of a run in one line: machine, samples, commit of the code."""
     run = run_of(source)
-    rows = _rows(run, dataset, "")
+    rows = rows_of(run, dataset, "")
     needs: dict[str, Any] = run.datasets[rows[0].dataset].get("needs") or {}
     validation = rows[0].n_validation
     held = f", {validation:,} for validation" if validation else ""
