@@ -137,6 +137,11 @@ def test_an_ensemble_gives_each_load_its_own_bound(tiny: Dataset) -> None:
     }
     within = (scores["test"]["relative_l2"] <= share).mean()
     assert covered(bound, scores, scaled=True) == {"test": within}
+    for wrong in (-spread, spread[:3], np.nan * spread):
+        with pytest.raises(InvalidInputError, match="`spread` must hold numbers >= 0 of shape"):
+            bound.of_prediction(predicted, wrong)
+    unknown = replace(bound, per_spread=np.inf).of_prediction(predicted, 0.0 * spread)
+    assert np.isinf(unknown).all()
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
     constant = mor_bench.error_bound(linear, tiny.validation, level=0.5)
     with pytest.raises(InvalidInputError, match="`spread` must be left out"):

@@ -93,7 +93,8 @@ class ErrorBound:
         Raises
         ------
         InvalidInputError
-            If a spread is given and the method is no ensemble.
+            If a spread is given and the method is no ensemble, or it is no number >= 0 for each
+            prediction.
         """
         counting = slice(None) if self.nodes is None else self.nodes
         found = np.asarray(displacements, dtype=np.float64)[..., counting, :]
@@ -104,7 +105,14 @@ class ErrorBound:
                 raise InvalidInputError(
                     "`spread` must be left out: this is not the bound of an ensemble."
                 )
-            share = self.per_spread * np.asarray(spread, dtype=np.float64)
+            given = np.asarray(spread, dtype=np.float64)
+            if given.shape not in ((), norm.shape) or not (given >= 0).all():
+                raise InvalidInputError(
+                    f"`spread` must hold numbers >= 0 of shape {norm.shape}; got {given}."
+                )
+            share = np.full(given.shape, inf)
+            if isfinite(self.per_spread):
+                share = self.per_spread * given
         within = np.where(share < 1, share, 0.0)
         return np.asarray(np.where(share < 1, within / (1 - within) * norm, inf))
 
