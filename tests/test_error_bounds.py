@@ -148,6 +148,16 @@ def test_an_ensemble_gives_each_load_its_own_bound(tiny: Dataset) -> None:
         constant.of_prediction(predicted, spread)
 
 
+def test_samples_are_groups_where_the_split_is_by_sample(tiny: Dataset) -> None:
+    """Loads on the same regions in all samples would otherwise be a single group."""
+    split = tiny.scene.spec.split.model_copy(update={"by": "sample"})
+    scene = replace(tiny.scene, spec=tiny.scene.spec.model_copy(update={"split": split}))
+    method = mor_bench.load_method("linear-fem").fit(scene, None)
+    bound = mor_bench.error_bound(method, replace(tiny.validation, scene=scene))
+    assert bound.n_groups == len(tiny.validation)
+    assert bound.relative_l2 < 1.0
+
+
 def test_only_wanted_nodes_count(tiny: Dataset) -> None:
     """The bound of a method that leaves out the other nodes is that of one that does not."""
     needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max"})

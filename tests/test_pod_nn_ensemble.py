@@ -40,6 +40,19 @@ def test_answer_and_spread_are_those_of_the_members(tiny: Dataset, input_kind: A
     expected = away / np.linalg.norm(mean, axis=(1, 2))
     np.testing.assert_allclose(ensemble.spread(forces), expected, rtol=1e-6)
     assert expected.min() > 0
+    assert ensemble.spread(forces[:0]).shape == (0,)
+
+
+def test_a_load_without_any_answer_has_an_infinite_spread(tiny: Dataset) -> None:
+    """From the force alone, a load that no training load resembles may give no displacement."""
+    size = {**SIZE, "n_input_modes": 2}
+    ensemble = PODNNEnsemble(n_members=2, input="force", **size).fit(tiny.scene, tiny.train)
+    touched = tiny.train.forces.any(axis=(0, 2))
+    unlike = np.zeros((tiny.scene.mesh.n_nodes, 3))
+    unlike[np.flatnonzero(~touched)[0], 2] = 1.0
+    assert not ensemble.predict(unlike).any()
+    assert ensemble.spread(unlike) == np.inf
+    assert ensemble.spread(0.0 * unlike) == 0.0
 
 
 def test_the_first_member_trains_as_a_single_network(tiny: Dataset) -> None:

@@ -120,6 +120,9 @@ class ErrorBound:
 def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> ErrorBound:
     """Calibrate a bound of a fitted method's error on samples that it has not learned from.
 
+    Samples of one load region count as one group if the scene's split is by region, as in a run.
+    Otherwise each sample is a group of its own.
+
     Parameters
     ----------
     method : Surrogate
@@ -159,7 +162,8 @@ def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> 
     predicted = predict_all(method, given)
     errors = sample_errors(predicted, samples.displacements, scene.output_nodes)
     spreads = method.spread(given.query) if isinstance(method, Ensemble) else None
-    bound = calibrated(errors.relative_l2, samples.regions, level, spreads)
+    regions = samples.regions if scene.spec.split.by == "region" else None
+    bound = calibrated(errors.relative_l2, regions, level, spreads)
     part = len(scene.output_nodes) < scene.mesh.n_nodes
     return replace(bound, nodes=scene.output_nodes) if part else bound
 

@@ -32,7 +32,7 @@ class Flagged(Answer):
 class Spread(Answer):
     """Disagreement of an ensemble for each load; None for other methods."""
 
-    spread: list[Annotated[float, Field(ge=0, allow_inf_nan=False)]] | None
+    spread: list[Annotated[float, Field(ge=0)]] | None
 
 
 class Counted(Answer):

@@ -217,9 +217,9 @@ class MethodSession(Session):
         if not isinstance(self.method, Ensemble):
             return {"spread": None}
         found = self.method.spread(given_of(self.scene, forces, parameters).query)
-        if found.shape != (len(forces),) or not (np.isfinite(found) & (found >= 0)).all():
+        if found.shape != (len(forces),) or not (found >= 0).all():
             raise InvalidInputError(
-                f"`spread` must return {len(forces)} finite numbers >= 0, one per load."
+                f"`spread` must return {len(forces)} numbers >= 0, one per load."
             )
         return {"spread": found.tolist()}
 

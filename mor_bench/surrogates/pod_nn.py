@@ -200,8 +200,9 @@ class PODNNEnsemble(PODNN):
         """Return how much the members disagree, relative to the prediction, of shape () or (n,).
 
         It is the root mean square over the members of the norm of their deviation from the mean,
-        divided by the norm of the mean; zero for a prediction of zero. It is no bound of an error:
-        `mor_bench.error_bound` finds the factor that makes it one.
+        divided by the norm of the mean. It is infinite if a load gives a prediction of zero, and
+        zero without load. It is no bound of an error: `mor_bench.error_bound` finds the factor that
+        makes it one.
 
         Parameters
         ----------
@@ -214,14 +215,16 @@ class PODNNEnsemble(PODNN):
             As in `predict`.
         """
         predicted = np.nan_to_num(self.predict(forces))
-        z = self.inputs_of(checked_given(self.scene_, forces).values)
+        given = checked_given(self.scene_, forces).values
+        z = self.inputs_of(given)
         members = (self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last
         if self._slope is not None:
             members -= z @ np.array([slope_at_rest(w) for w in self.networks_.values()])
         squared = (self.norms_of(members - members.mean(axis=0)) ** 2).mean(axis=0)
-        norms = np.linalg.norm(predicted.reshape(len(z), -1), axis=1)
-        relative = np.sqrt(squared) / np.where(norms > 0, norms, np.inf)
-        return np.asarray(relative.reshape(np.shape(forces)[:-2]))
+        norms = np.linalg.norm(predicted.reshape(given.shape), axis=(1, 2))
+        relative = np.where(given.any(axis=(1, 2)), np.inf, 0.0)
+        np.divide(np.sqrt(squared), norms, out=relative, where=norms > 0)
+        return np.asarray(relative.reshape(np.shape(predicted)[:-2]))
 
     def _hidden(self, z: Array) -> Array:
         """Return the last hidden layers at z (n, n_inputs), (n_members, n, n_hidden)."""
