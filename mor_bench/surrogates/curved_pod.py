@@ -14,7 +14,7 @@ from mor_bench.mechanics.compliance import Compliance, project
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.model_arrays import take_array
-from mor_bench.reduction.basis import pod
+from mor_bench.reduction.basis import accurate_modes, pod
 from mor_bench.reduction.coordinates import error_weights
 from mor_bench.reduction.cubature import sparse_nnls
 from mor_bench.reduction.curved import (
@@ -97,7 +97,7 @@ class CurvedPOD(Surrogate):
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         model, displacements = FullOrderModel(scene), samples.free_displacements
-        primary = pod(displacements, self.n_latent).modes
+        primary = accurate_modes(displacements, self.n_latent)
         offsets = np.zeros_like(displacements)
         if self.static_correction:
             offsets = model.rest_factor.solve(samples.free_forces.T).T
