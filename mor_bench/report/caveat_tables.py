@@ -102,14 +102,17 @@ def error_bounds(entries: Sequence[Entry]) -> TextTable | None:
         found = entry.row.bound
         assert found is not None
         samples = f"{found.n} in {found.n_groups}"
-        bounds = [(entry.label, found.relative_l2, found.coverage)]
-        if found.scaled and "test" in found.scaled.widths:
-            label = f"{entry.label} × spread"
-            bounds.append((label, found.scaled.widths["test"], found.scaled.coverage))
-        for label, width, coverage in bounds:
-            shares = (coverage.get(name) for name in names)
-            shown = (DASH if share is None else percent(share) for share in shares)
-            rows.append([label, percent(width), samples, *shown])
+        shares = (found.coverage.get(name) for name in names)
+        shown = (DASH if share is None else percent(share) for share in shares)
+        rows.append([entry.label, percent(found.relative_l2), samples, *shown])
+        if (scaled := found.scaled) and scaled.widths:
+            shown = (
+                f"{percent(scaled.coverage[name])} ({percent(scaled.widths[name])})"
+                if name in scaled.widths
+                else DASH
+                for name in names
+            )
+            rows.append([f"{entry.label} × spread", "of each load", samples, *shown])
     level = percent(bounded[0].row.bound.level if bounded[0].row.bound else None)
     note = (
         f"Bound: {level} % of new loads have at most this relative L2 error, if they are like the "
@@ -120,7 +123,7 @@ def error_bounds(entries: Sequence[Entry]) -> TextTable | None:
     if any(e.row.bound.scaled for e in bounded if e.row.bound):
         note += (
             " × spread: every load has a bound of its own, proportional to the disagreement of "
-            "the ensemble; shown is the median over the test."
+            "the ensemble. Its median over the test set stands in parentheses (%)."
         )
     headings = ["configuration", "bound (%)", "samples in groups", *names]
     return TextTable("Error bounds", note, headings, rows)

@@ -102,8 +102,9 @@ class _Scorer:
                 indicated.add(start, forces, predicted)
                 found = self.worker.ask("flag", LOAD_LIMIT_S, **test.queries(chunk))["flagged"]
                 flags = None if found is None or flags is None else flags + found
-                found = self.worker.ask("spread", left_s, **test.queries(chunk))["spread"]
-                spreads = None if found is None or spreads is None else spreads + found
+                if spreads is not None:
+                    found = self.worker.ask("spread", left_s, **test.queries(chunk))["spread"]
+                    spreads = None if found is None else spreads + found
             score: Score = {
                 name: np.concatenate([getattr(part, name) for part in errors]) for name in ERRORS
             }

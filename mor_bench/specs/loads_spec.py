@@ -195,7 +195,7 @@ class Pressure(StrictModel):
     regions : list of Region
         The facets with all corners in a region are pressed.
     follower : bool
-        Whether the pressures act on the deformed surface, along its normals. Default: false.
+        Whether the pressures follow the deformed surface. Default: false, dead loads along normals.
     magnitude_pa : two floats
         Range of each pressure, Pa. It pushes into the body; a negative one pulls.
     samples : int

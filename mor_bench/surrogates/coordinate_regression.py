@@ -216,9 +216,7 @@ class CoordinateRegression(Surrogate, ABC):
         self._expanding = np.ascontiguousarray(expanding.T)
 
     def answer(self, forces: Array) -> Array:
-        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
-        if self._kinked:
-            loads = self.response_.respond(loads)
+        loads = self._driving(forces)
         coefficients = self.coefficients(project(self.from_forces_, loads))
         if is_counting():
             count(multiply_adds=len(loads) * min(self._expanding.size, self.modes_.size))
@@ -229,14 +227,18 @@ class CoordinateRegression(Surrogate, ABC):
 
     def inputs_of(self, forces: Array) -> Array:
         """Return the inputs z (n, n_inputs) of g under checked forces (n, n_nodes, 3)."""
-        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
-        return project(self.from_forces_, self.response_.respond(loads) if self._kinked else loads)
+        return project(self.from_forces_, self._driving(forces))
 
     def norms_of(self, coefficients: Array) -> Array:
         """Return the norms of Φ g at the wanted nodes, m, from coefficients g (…, n_outputs)."""
         gram = self._expanding @ self._expanding.T
         squared = ((coefficients @ gram) * coefficients).sum(axis=-1)
         return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+
+    def _driving(self, forces: Array) -> Array:
+        """Return what z is linear in, (n, n_dofs): the loads, or their response if kinked."""
+        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
+        return self.response_.respond(loads) if self._kinked else loads
 
     def _added(self, loads: Array) -> Array:
         """Return the linear response at the wanted dofs; ``loads`` is it where it is kinked."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -97,8 +97,12 @@ class PODNN(NetworkRegression):
                 member.take(self._weights_of(self.training.start_from, name, scale))
         networks = nn.ModuleList(members.values()).to(data["inputs"].device)
         losses = [self._loss(member, data) for member in members.values()]
-        # Adam steps each weight alone, so a step on the sum is a step of every member.
-        known = self.train(networks, lambda rows: _sum(f(rows) for f in losses), data, generator)
+
+        def loss(rows: Tensor) -> Tensor:
+            """Return the sum; Adam steps each weight alone, so every member takes its own step."""
+            return torch.stack([of_member(rows) for of_member in losses]).sum()
+
+        known = self.train(networks, loss, data, generator)
         for name, member in members.items():
             weights = member.arrays()
             weights[-1] *= scale
@@ -146,7 +150,8 @@ class PODNN(NetworkRegression):
         super().take(model)
         self._slope: Array | None = None
         if self.input == "linear-response":
-            self._slope = np.mean([slope_at_rest(w) for w in self.networks_.values()], axis=0)
+            self._slopes = np.array([slope_at_rest(w) for w in self.networks_.values()])
+            self._slope = self._slopes.mean(axis=0)
 
     def values(self, z: Array) -> Array:
         return evaluate(self.networks_["network"], z)
@@ -219,7 +224,7 @@ class PODNNEnsemble(PODNN):
         z = self.inputs_of(given)
         members = (self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last
         if self._slope is not None:
-            members -= z @ np.array([slope_at_rest(w) for w in self.networks_.values()])
+            members -= z @ self._slopes
         squared = (self.norms_of(members - members.mean(axis=0)) ** 2).mean(axis=0)
         norms = np.linalg.norm(predicted.reshape(given.shape), axis=(1, 2))
         relative = np.where(given.any(axis=(1, 2)), np.inf, 0.0)
@@ -231,10 +236,3 @@ class PODNNEnsemble(PODNN):
         (first, first_bias), (second, second_bias) = self._first, self._second
         x = silu(z @ first + first_bias).reshape(len(z), self.n_members, self.n_hidden)
         return silu(x.transpose(1, 0, 2) @ second + second_bias)
-
-
-def _sum(losses: Iterable[Tensor]) -> Tensor:
-    first, *others = losses
-    for other in others:
-        first = first + other
-    return first

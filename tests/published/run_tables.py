@@ -259,13 +259,20 @@ def covered(source: str) -> str:
     for (dataset, method), (row, told) in sorted(found.items(), key=lambda item: item[0][0]):
         if row.bound is None or row.reference:
             continue
-        bounds_of = [(f"`{method}`", row.bound.relative_l2, row.bound.coverage)]
+        size, shares = row.bound.relative_l2, row.bound.coverage
+        cells = [f"`{dataset}`", f"`{method}`", told, f"{row.bound.n_groups}", _percent(size)]
+        cells += [number(size / median_error(row)) if isfinite(size) else DASH]
+        body.append([*cells, *(_percent(shares[s]) if s in shares else DASH for s in names)])
         if scaled := row.bound.scaled:
-            bounds_of.append((f"`{method}` × spread", scaled.widths["test"], scaled.coverage))
-        for label, size, shares in bounds_of:
-            cells = [f"`{dataset}`", label, told, f"{row.bound.n_groups}", _percent(size)]
-            cells += [number(size / median_error(row)) if isfinite(size) else DASH]
-            body.append([*cells, *(_percent(shares[s]) if s in shares else DASH for s in names)])
+            cells = [f"`{dataset}`", f"`{method}` × spread", told, cells[3], "of each load"]
+            cells.append(number(scaled.widths["test"] / median_error(row)))
+            shown = (
+                f"{_percent(scaled.coverage[s])} ({_percent(scaled.widths[s])})"
+                if s in scaled.widths
+                else DASH
+                for s in names
+            )
+            body.append([*cells, *shown])
     sets = ["split's test part" if name == "test" else f"`{name}`" for name in names]
     headings = ["dataset", "method", "is given", "regions", "bound", "bound / median", *sets]
     return markdown(headings, body)
