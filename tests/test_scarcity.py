@@ -20,7 +20,7 @@ from typing import Any
 import psutil
 import pytest
 
-from mor_bench.machine import GROUPS, memory_limit_bytes
+from mor_bench.machine import GROUPS, LEAST_ADDRESS_SPACE_BYTES, memory_limit_bytes
 from mor_bench.results.comparison import Comparison
 from mor_bench.sandbox.process import MEMORY_SHARE
 from tests.small_runs import COMMAND, descent_file, method_file, wait_for
@@ -146,24 +146,24 @@ def test_the_memory_limit_of_a_container_counts(tmp_path: Path) -> None:
 
 @linux_only
 @pytest.mark.slow
-@pytest.mark.parametrize("kib", [2_000_000, 1_000_000, 500_000])
-def test_little_address_space_changes_no_row_or_is_one_line(
-    kib: int, undisturbed: dict[str, str], tmp_path: Path
+def test_two_gigabytes_of_address_space_change_no_row(
+    undisturbed: dict[str, str], tmp_path: Path
 ) -> None:
+    kib = LEAST_ADDRESS_SPACE_BYTES // 1024
     done = shell(f"ulimit -v {kib}; {RUN} --out out --cache cache", tmp_path)
-    if done.returncode == 0:
-        assert "Traceback" not in done.stderr
-        assert result(tmp_path) == undisturbed
-    else:
-        assert done.returncode in (1, 2), done
-        assert "Traceback" not in done.stderr
-        if done.returncode == 2:
-            check_is_one_line(done.stderr)
-        else:  # a configuration failed, and its row says why
-            rows = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
-            assert all(row["reason"] for row in rows if row["status"] == "failed")
-            assert any(row["status"] == "failed" for row in rows)
-        assert kib < 2_000_000, "2 GB are enough for this run"
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert result(tmp_path) == undisturbed
+
+
+@linux_only
+@pytest.mark.parametrize("kib", [LEAST_ADDRESS_SPACE_BYTES // 1024 - 1, 1_000_000, 500_000])
+def test_less_address_space_is_refused(kib: int, tmp_path: Path) -> None:
+    done = shell(f"ulimit -v {kib}; {RUN} --out out --cache cache", tmp_path)
+    assert done.returncode == 2, done
+    check_is_one_line(done.stderr)
+    assert "the address space must be at least 2 GB" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from mor_bench.cli.clear_errors import (
 )
 from mor_bench.cli.clear_warnings import clear_warnings
 from mor_bench.cli.windows_job import end_children_with_this_process
+from mor_bench.machine import check_address_space
 
 COMMANDS = {
     "run": (
@@ -126,6 +127,7 @@ class LazyCommands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         with clear_errors():  # before Typer catches interrupts
+            check_address_space()
             return super().invoke(ctx)
 
 
