@@ -45,6 +45,9 @@ METHODS: dict[str, dict[str, Any]] = {
     "pod-nn-force": {},
     "pod-ann": {},
     "latent-galerkin": {},
+    "latent-lspg": {},
+    "pod-nn-derivative": {},
+    "pod-nn-ensemble": {},
 }
 """Methods, and parameters that replace those of their files."""
 
