@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import mor_bench
+from mor_bench.counting import counted
 from mor_bench.errors import StoreError
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.mesh import box_mesh
@@ -131,6 +133,27 @@ def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> Non
         best = np.linalg.svd(rows, full_matrices=False)[2][:8]
         modes = method.arrays_["constant.modes"]
         np.testing.assert_allclose(best.T @ (best @ modes), modes, atol=1e-9 * np.abs(modes).max())
+
+
+@pytest.mark.parametrize("name", ["deeponet", "pod-deeponet"])
+def test_deeponet_answers_few_outputs_with_less_work(name: str, tiny: Dataset) -> None:
+    """Wanted displacements are those of a query for all; the others are NaN or held at zero."""
+    needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max"})
+    few = replace(tiny.scene, spec=tiny.scene.spec.model_copy(update={"needs": needs}))
+    whole, part = (make(name).fit(scene, tiny.train) for scene in (tiny.scene, few))
+    forces, work = np.concatenate([tiny.test.forces[:9], 0.0 * tiny.test.forces[:1]]), []
+    answers = []
+    for method in (whole, part):
+        with counted() as found:
+            answers.append(method.predict(forces))
+        work.append(found.multiply_adds)
+    nodes = few.output_nodes
+    size = np.abs(answers[0]).max()
+    np.testing.assert_allclose(answers[1][:, nodes], answers[0][:, nodes], 0, 1e-6 * size)
+    others = np.setdiff1d(np.arange(few.mesh.n_nodes), [*nodes, *few.fixed_nodes])
+    assert np.isnan(answers[1][:-1, others]).all()
+    assert not answers[1][-1].any()
+    assert work[1] < work[0]
 
 
 @pytest.mark.parametrize("input", ["force", "linear-response"])

@@ -13,6 +13,7 @@ from torch import Tensor
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import change_of_basis, input_axes
+from mor_bench.reduction.subspace import wanted_dofs
 from mor_bench.surrogates.field_network import (
     FieldNetwork,
     OperatorSurrogate,
@@ -38,32 +39,38 @@ class DeepONetNetwork(FieldNetwork):
         Node positions relative to the size of the body.
     modes : (n_dofs, n_functions) float32 or None
         Values of tₖ at the nodes; None for a trunk network.
-    n_functions, width, depth : int
-        Number of functions; units and number of the hidden layers of branch and trunk.
+    wanted : (n_wanted,) int64 or None
+        Dofs that are answered after `precompute`, the others with NaN; None for all.
+    n_functions : int
+        Number of functions.
+    hidden : list of int
+        Units of the hidden layers of branch and trunk.
     """
 
     axes: Tensor
     positions: Tensor
     functions: Tensor | None
+    wanted: Tensor | None
 
     def __init__(
         self,
         axes: Tensor,
         positions: Tensor,
         modes: Tensor | None,
+        wanted: Tensor | None,
         n_functions: int,
-        width: int,
-        depth: int,
+        hidden: list[int],
     ) -> None:
         super().__init__()
         functions = None if modes is None else modes.T.contiguous()
-        add_constants(self, axes=axes, positions=positions, functions=functions)
-        self.branch = perceptron(axes.shape[1], *[width] * depth, n_functions)
-        self.trunk = perceptron(3, *[width] * depth, 3 * n_functions) if modes is None else None
+        constants = {"axes": axes, "positions": positions, "functions": functions}
+        add_constants(self, **constants, wanted=wanted)
+        self.branch = perceptron(axes.shape[1], *hidden, n_functions)
+        self.trunk = perceptron(3, *hidden, 3 * n_functions) if modes is None else None
         self.n_functions = n_functions
 
     def basis(self) -> Tensor:
-        """Return the values of the functions at the nodes, (n_functions, n_dofs)."""
+        """Return the functions at the nodes, (n_functions, n_dofs), or at the wanted dofs."""
         if self.functions is not None:
             functions: Tensor = self.functions
             return functions
@@ -76,11 +83,18 @@ class DeepONetNetwork(FieldNetwork):
         return fields.flatten(1) @ self.axes
 
     def forward(self, features: Tensor) -> Tensor:
-        answer: Tensor = self.branch(features) @ self.basis()
+        basis, n_dofs = self.basis(), len(self.axes)
+        answer: Tensor = self.branch(features) @ basis
+        if basis.shape[1] < n_dofs:
+            wanted, answer = answer, answer.new_full((len(features), n_dofs), torch.nan)
+            answer[:, self.wanted] = wanted
         return answer.view(len(features), -1, 3)
 
     def precompute(self) -> None:
-        self.functions = self.basis().contiguous()
+        functions = self.basis()
+        self.functions = (
+            functions if self.wanted is None else functions[:, self.wanted]
+        ).contiguous()
 
     @property
     def multiply_adds(self) -> int:
@@ -141,8 +155,10 @@ class DeepONet(OperatorSurrogate):
         if self.trunk == "pod":
             modes = _single(take_array(constants, "modes", shape))
             n_functions = modes.shape[1]
-        positions = scaled_positions(self.scene_.mesh)
-        return DeepONetNetwork(axes, positions, modes, n_functions, self.width, self.depth)
+        positions, dofs = scaled_positions(self.scene_.mesh), wanted_dofs(self.scene_)
+        wanted = None if dofs is None else torch.from_numpy(dofs)
+        hidden = [self.width] * self.depth
+        return DeepONetNetwork(axes, positions, modes, wanted, n_functions, hidden)
 
     def turned(self, weights: dict[str, Tensor], source: Arrays, target: Arrays) -> Any:
         """Convert the branch's first layer to the new axes, and its last one to the new modes."""
