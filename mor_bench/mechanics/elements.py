@@ -113,9 +113,10 @@ def shape_gradients(
     InvalidInputError
         If det J is not positive at some point: the cell is inverted or degenerate.
     """
-    each = np.broadcast_to(derivatives, (len(cells), *derivatives.shape[-3:]))
-    jacobian = np.einsum("cqai,cak->cqki", each, points[cells])
-    det_j = np.linalg.det(jacobian)
+    jacobian = points[cells].swapaxes(1, 2)[:, None] @ derivatives  # [k, i] = dX_k / dξ_i
+    a, b, c = np.moveaxis(jacobian, -1, 0)
+    adjugate = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
+    det_j = (a * adjugate[..., 0, :]).sum(axis=-1)
     # The det J of a flat cell is of round-off size rather than zero.
     least = 1e-12 * np.linalg.norm(jacobian, axis=(2, 3)) ** 3
     if not np.all(det_j > least):
@@ -124,4 +125,4 @@ def shape_gradients(
             f"cell {cell} is inverted or degenerate: det J must be > 0 m³; "
             f"got {det_j[cell, point]:.3g} at quadrature point {point}."
         )
-    return np.einsum("cqai,cqik->cqak", each, np.linalg.inv(jacobian)), det_j
+    return derivatives @ (adjugate / det_j[..., None, None]), det_j

@@ -182,7 +182,11 @@ def warp_of(
     element = element_of(cells)
     gradients, det_j = shape_gradients(points, cells, element.derivatives)
     weighted = gradients * (det_j * element.weights)[:, :, None, None]
-    laplacians = np.einsum("cqai,cqbi->cab", weighted, gradients)
+    n_cells, n_own = cells.shape
+    left, right = (
+        each.swapaxes(1, 2).reshape(n_cells, n_own, -1) for each in (weighted, gradients)
+    )
+    laplacians = left @ right.swapaxes(1, 2)
     held = pattern.pad(np.ones(pattern.n)).reshape(-1, 3) == 0.0
     try:
         return Warp(WarpedCells(*turning[:2], weighted.sum(axis=1), laplacians), held, place)

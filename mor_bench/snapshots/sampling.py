@@ -30,7 +30,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.acting import Acting
@@ -276,6 +275,8 @@ def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | No
     SpecError
         If there is no such set.
     """
+    from scipy.spatial.distance import cdist  # slow to import
+
     points = np.frombuffer(centres).reshape(-1, 3)
     if k > 1 and len(points) > MAX_PAIRED:
         raise SpecError(
