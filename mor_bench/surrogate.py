@@ -267,7 +267,8 @@ class Surrogate:
         """Flag loads outside the range of the training loads, as a bool array of shape () or (n,).
 
         A flag is not a bound on the error, see `mor_bench.snapshots.load_range`. A method that
-        needs no snapshots flags nothing. Parameters and errors are those of `predict`.
+        needs no snapshots has no range, unless it prepares for certain loads. Parameters and errors
+        are those of `predict`.
 
         Raises
         ------
@@ -281,11 +282,11 @@ class Surrogate:
                 "not known."
             )
         given = self._checked(forces, parameters)
-        if not self.needs_snapshots:
-            flags = np.zeros(len(given), dtype=bool)
-        elif hasattr(self, "range_"):
+        if hasattr(self, "range_"):
             bodies = given.parameters if isinstance(given, ParametricForces) else None
             flags = self.range_.excludes(given.values, bodies)
+        elif not self.needs_snapshots:
+            flags = np.zeros(len(given), dtype=bool)
         elif self.scene_.observed_nodes is not None:
             raise UnknownRangeError(
                 f"{self.scene_.name}: the range of the training loads is not known: "

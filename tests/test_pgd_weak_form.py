@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import mor_bench
 from mor_bench.errors import InvalidInputError, OutOfTimeError, UnsupportedSceneError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.method_loading import load_fitted
 from mor_bench.reduction.alternating_directions import decompose, rank_one
 from mor_bench.reduction.load_grid import interval_rule, load_grid, sphere_rule
 from mor_bench.reduction.weak_form import Family, Term, WeakForm
@@ -19,10 +21,13 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import load_generated_spec
 from mor_bench.surrogates.monomials import by_degree, monomial_indices
+from mor_bench.surrogates.pgd import SeparatedLoad
 from mor_bench.surrogates.pgd_weak_form import WeakFormPGD
 from tests.relative_errors import median_error, relative_l2
 
 Array = NDArray[np.float64]
+
+PRESSURE = {"kind": "pressure", "regions": ["z-max"], "magnitude_pa": [0.0, 1.0], "samples": 4}
 
 
 def scene_of(**changes: Any) -> Scene:
@@ -248,6 +253,23 @@ def test_other_scenes_are_refused_with_the_reason() -> None:
     content = load_generated_spec("beam-tiny").model_dump(mode="json", exclude={"loads", "tests"})
     bare = mor_bench.load_scene({**content, "loads": None})
     assert "no loads are given" in str(WeakFormPGD().supports(bare))
+    pressed = mor_bench.load_scene({**content, "loads": PRESSURE, "split": {"by": "sample"}})
+    for method in (WeakFormPGD(), SeparatedLoad()):
+        assert "here pressures act" in str(method.supports(pressed))
+
+
+def test_loads_beyond_those_of_the_grid_are_flagged(few: Scene, tmp_path: Path) -> None:
+    """The grid has single loads on two patches, in all directions, up to the largest magnitude."""
+    method = WeakFormPGD(n_terms=1).fit(few)
+    method.save(tmp_path / "model.safetensors")
+    weights, along = few.patch_weights.toarray(), np.array([0.6, 0.0, -0.8])
+    one, other = weights[:, :, None] * along * method.largest_
+    far = np.zeros_like(one)
+    far[np.flatnonzero(~weights.any(axis=0))[-1]] = 0.1 * method.largest_ * along
+    loads = np.stack([one, other, 0.0 * one, 1.1 * one, 0.5 * (one + other), far])
+    wanted = [False, False, False, True, True, True]
+    for found in (method, load_fitted(tmp_path / "model.safetensors", WeakFormPGD, few)):
+        assert found.out_of_range(loads).tolist() == wanted
 
 
 @pytest.mark.parametrize(

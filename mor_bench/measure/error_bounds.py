@@ -149,7 +149,7 @@ def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> 
     An ensemble also gives every load a bound of its own:
 
     >>> ensemble = mor_bench.load_method("pod-nn-ensemble", iterations=50)
-    >>> bound = error_bound(ensemble.fit(data.scene, data.train), data.train, level=0.5)
+    >>> bound = error_bound(ensemble.fit(data.scene, data.train), data.validation, level=0.5)
     >>> forces = data.test.forces
     >>> bound.of_prediction(ensemble.predict(forces), ensemble.spread(forces)).shape
     (40,)

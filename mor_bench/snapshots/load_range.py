@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
+from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.patch_loads import PatchLoads
 
@@ -81,6 +82,15 @@ class LoadRange:
         drawn = snapshots.parameters
         ends = np.array([drawn.min(axis=0), drawn.max(axis=0)])
         return cls(size, width, loaded, moments[loaded] / traces[loaded, None, None], ends)
+
+    @classmethod
+    def of_single_loads(cls, scene: Scene, largest_n: float) -> Self:
+        """Return the range of forces up to a size, N, in all directions on one patch of a scene."""
+        weights = scene.patch_weights
+        width = float((1.0 / np.asarray(weights.multiply(weights).sum(axis=1))).max())
+        nodes = np.unique(weights.indices).astype(np.int64)
+        moments = np.broadcast_to(np.eye(3) / 3.0, (len(nodes), 3, 3))
+        return cls(largest_n, width, nodes, moments)
 
     @classmethod
     def from_arrays(

@@ -17,6 +17,7 @@ from mor_bench.reduction.subspace import wanted_dofs
 from mor_bench.surrogates.field_network import (
     FieldNetwork,
     OperatorSurrogate,
+    SampleLoss,
     add_constants,
     n_products,
     perceptron,
@@ -124,6 +125,9 @@ class DeepONet(OperatorSurrogate):
         Number of functions; with POD, capped at the rank.
     width, depth : int
         Units and number of the hidden layers in branch and trunk.
+    loss : {"absolute", "relative", "auto"}
+        Mean squared error, without or with division by each sample's mean square. "auto" divides
+        for the linear response only.
     """
 
     input: Input = "force"
@@ -132,6 +136,7 @@ class DeepONet(OperatorSurrogate):
     n_functions: Annotated[int, Field(ge=1)] = 64
     width: Annotated[int, Field(ge=1)] = 128
     depth: Annotated[int, Field(ge=1)] = 3
+    loss: SampleLoss = "absolute"
     iterations: Annotated[int, Field(ge=1)] = 20_000
     batch_size: Annotated[int, Field(ge=1)] = 64
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 2e-3

@@ -25,10 +25,21 @@ from mor_bench.reduction.subspace import at_wanted, wanted_dofs
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.specs import DatasetSpec
+from mor_bench.specs.loads_spec import AnyLoads, Pressure
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.monomials import Levels, by_degree, monomial_indices
 
 Array = NDArray[np.float64]
+
+
+def not_single(plan: AnyLoads) -> str | None:
+    """Return why loads are not forces on one patch at a time; None if they are."""
+    if isinstance(plan, Pressure):
+        return "it is for forces on patches, and here pressures act"
+    return (
+        "it handles one load patch, and here several act at once" if plan.simultaneous > 1 else None
+    )
+
 
 FLAT = 1e-6
 """Smallest extent of the load positions along a coordinate axis, relative to the body."""
@@ -129,8 +140,8 @@ class SeparatedLoad(Surrogate):
     ridge: Annotated[float, Field(ge=0)] = 1e-4
 
     def supports(self, scene: Scene) -> str | None:
-        if isinstance(scene.spec, DatasetSpec) and scene.spec.load_plan.simultaneous > 1:
-            return "it handles one load patch, and here several act at once"
+        if isinstance(scene.spec, DatasetSpec) and (reason := not_single(scene.spec.load_plan)):
+            return reason
         return (
             unknown_equations(scene) if self.base == "linear-response" else super().supports(scene)
         )

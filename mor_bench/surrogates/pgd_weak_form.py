@@ -23,10 +23,11 @@ from mor_bench.reduction.tensors import has_polynomial
 from mor_bench.reduction.weak_form import Family, Term, WeakForm
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.specs import DatasetSpec
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.monomials import Levels, by_degree, monomial_indices
-from mor_bench.surrogates.pgd import load_coordinates
+from mor_bench.surrogates.pgd import load_coordinates, not_single
 
 Array = NDArray[np.float64]
 
@@ -90,9 +91,7 @@ class WeakFormPGD(Surrogate):
             )
         if not isinstance(scene.spec, DatasetSpec) or scene.spec.loads is None:
             return "it needs the load patches of the scene, and no loads are given"
-        if scene.spec.load_plan.simultaneous > 1:
-            return "it handles one load patch, and here several act at once"
-        return None
+        return not_single(scene.spec.load_plan)
 
     @property
     def _degrees(self) -> range:
@@ -152,6 +151,7 @@ class WeakFormPGD(Surrogate):
         self.largest_ = float(take_array(model, "largest", (1,))[0])
         if not self.largest_ > 0:
             raise InvalidInputError(f"`largest` must be > 0; got {self.largest_}.")
+        self.range_ = LoadRange.of_single_loads(scene, self.largest_)
         self.vectors_ = take_array(model, "vectors", (None, len(scene.free_dofs)))
         n_terms = len(self.vectors_)
         n_directions = sum((j + 1) * (j + 2) // 2 for j in self._degrees)

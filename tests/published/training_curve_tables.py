@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+from math import log2
 from statistics import median
 from typing import Any
 
@@ -12,13 +15,18 @@ from tests.published.stored import content_of
 
 Points = list[dict[str, Any]]
 
+FLATNESS = (
+    "falls of the validation error by the last doublings, %",
+    f"flat (both < {100 * FLAT:.0f} %)",
+)
+"""Headings of the cells of `flatness`."""
 
-def _by_method(source: str) -> dict[str, Points]:
+
+def _by_method(source: str, methods: str) -> dict[str, Points]:
+    """Return the points of each method, or of the named ones, NAME,NAME,…."""
     points: Points = content_of(source)["points"]
-    return {
-        name: [point for point in points if point["method"] == name]
-        for name in dict.fromkeys(point["method"] for point in points)
-    }
+    names = methods.split(",") if methods else dict.fromkeys(point["method"] for point in points)
+    return {name: [point for point in points if point["method"] == name] for name in names}
 
 
 def _grouped(points: Points, key: str) -> dict[int, Points]:
@@ -36,39 +44,47 @@ def _cell(points: Points) -> str:
     return f"{_error(points):.1e} ({low} to {high})".replace("e-0", "e-")
 
 
-def training_iterations(source: str) -> str:
+def flatness(errors: Sequence[float]) -> list[str]:
+    """Return how far validation errors fall by the last two doublings, in %, and the verdict.
+
+    A curve is flat if both falls are below `FLAT`, and rises if the last error is larger by more
+    than that.
+    """
+    falls = [1 - after / before for before, after in pairwise(errors)][-2:]
+    if falls[-1] < -FLAT:
+        verdict = "rises"
+    else:
+        verdict = "yes" if len(falls) == 2 and max(falls) < FLAT else "no"
+    return [", ".join(f"{100 * fall:.0f}" for fall in falls), verdict]
+
+
+def training_iterations(source: str, methods: str = "") -> str:
     """Show e of test samples over the iterations, with all training samples."""
     body, most = [], 0
-    for name, points in _by_method(source).items():
+    for name, points in _by_method(source, methods).items():
         whole = max(point["n_train"] for point in points)
         curve = _grouped([point for point in points if point["n_train"] == whole], "iterations")
-        numbers, sets = list(curve), list(curve.values())
-        most = max(most, len(numbers))
-        before, last = (_error(part, "validation") for part in sets[-2:])
+        first, sets = min(curve), list(curve.values())
+        cells = {round(log2(n / first)): _cell(part) for n, part in curve.items()}
+        most = max(most, *cells)
         relative = median(point["test"]["rel_l2_median"] for point in sets[-1])
-        body.append(
-            (
-                [f"`{name}`", f"{numbers[0]:,}", *map(_cell, sets)],
-                [
-                    number(100 * float(relative)),
-                    number(float(median(point["core_s"] for point in sets[-1]))),
-                    f"{100 * (1 - last / before):.0f}",
-                    "yes" if last > (1 - FLAT) * before else "no",
-                ],
-            )
-        )
+        seconds = float(median(point["core_s"] for point in sets[-1]))
+        last = [number(100 * float(relative)), number(seconds)]
+        verdict = flatness([_error(part, "validation") for part in sets])
+        body.append(([f"`{name}`", f"{first:,}"], cells, last + verdict))
     headings = ["method", "first number of iterations", "e with it, m"]
-    headings += [f"with {2**i} times as many" for i in range(1, most)]
-    headings += ["median % of the last", "core-s of the last"]
-    headings += ["fall of the validation error by the last doubling, %"]
-    rows = [first + ["–"] * (most + 2 - len(first)) + rest for first, rest in body]
-    return markdown([*headings, f"flat (< {100 * FLAT:.0f} %)"], rows)
+    headings += [f"with {2**i} times as many" for i in range(1, most + 1)]
+    headings += ["median % of the last", "core-s of the last", *FLATNESS]
+    rows = [
+        start + [cells.get(i, "–") for i in range(most + 1)] + end for start, cells, end in body
+    ]
+    return markdown(headings, rows)
 
 
-def training_samples(source: str) -> str:
+def training_samples(source: str, methods: str = "") -> str:
     """Show e of test samples over the training samples; iterations are those of the files."""
     body, sizes = [], []
-    for name, points in _by_method(source).items():
+    for name, points in _by_method(source, methods).items():
         fewest = min(point["n_train"] for point in points)
         (usual,) = {point["iterations"] for point in points if point["n_train"] == fewest}
         curve = _grouped([point for point in points if point["iterations"] == usual], "n_train")
