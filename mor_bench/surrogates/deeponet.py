@@ -136,7 +136,7 @@ class DeepONet(OperatorSurrogate):
     n_functions: Annotated[int, Field(ge=1)] = 64
     width: Annotated[int, Field(ge=1)] = 128
     depth: Annotated[int, Field(ge=1)] = 3
-    loss: SampleLoss = "absolute"
+    loss: SampleLoss = "auto"
     iterations: Annotated[int, Field(ge=1)] = 20_000
     batch_size: Annotated[int, Field(ge=1)] = 64
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 2e-3

@@ -57,7 +57,7 @@ class OperatorSurrogate(FieldSurrogate):
     """
 
     network_: FieldNetwork
-    loss: SampleLoss = "absolute"
+    loss: SampleLoss = "auto"
 
     @abstractmethod
     def build_network(self, constants: Arrays) -> FieldNetwork: ...

@@ -203,7 +203,7 @@ class FourierNeuralOperator(OperatorSurrogate):
     channels: Annotated[int, Field(ge=1, le=512)] = 20
     modes: Annotated[int, Field(ge=1)] = 6
     layers: Annotated[int, Field(ge=1, le=16)] = 4
-    loss: SampleLoss = "absolute"
+    loss: SampleLoss = "auto"
     iterations: Annotated[int, Field(ge=1)] = 2000
     batch_size: Annotated[int, Field(ge=1)] = 32
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3

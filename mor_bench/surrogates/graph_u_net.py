@@ -265,7 +265,7 @@ class MultiScaleGraphNet(OperatorSurrogate):
     width: Annotated[int, Field(ge=1, le=512)] = 32
     levels: Annotated[int, Field(ge=1, le=8)] = 3
     steps: Annotated[int, Field(ge=1, le=16)] = 2
-    loss: SampleLoss = "absolute"
+    loss: SampleLoss = "auto"
     iterations: Annotated[int, Field(ge=1)] = 2000
     batch_size: Annotated[int, Field(ge=1)] = 16
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3

@@ -124,7 +124,7 @@ class MeshGraphNet(OperatorSurrogate):
     width: Annotated[int, Field(ge=1, le=1024)] = 128
     steps: Annotated[int, Field(ge=1, le=64)] = 15
     hidden_layers: Annotated[int, Field(ge=1, le=4)] = 2
-    loss: SampleLoss = "absolute"
+    loss: SampleLoss = "auto"
     iterations: Annotated[int, Field(ge=1)] = 1000
     batch_size: Annotated[int, Field(ge=1)] = 8
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3

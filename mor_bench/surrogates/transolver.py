@@ -182,7 +182,7 @@ class Transolver(OperatorSurrogate):
     slices: Annotated[int, Field(ge=1, le=1024)] = 32
     layers: Annotated[int, Field(ge=1, le=64)] = 1
     mlp_ratio: Annotated[int, Field(ge=1, le=16)] = 2
-    loss: SampleLoss = "absolute"
+    loss: SampleLoss = "auto"
     iterations: Annotated[int, Field(ge=1)] = 8000
     batch_size: Annotated[int, Field(ge=1)] = 8
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3
