@@ -186,10 +186,8 @@ def out_of_distribution(name: str, subject: Subject) -> Outcome:
     data = subject.scenes.pressed if pressed else subject.data
     method = subject.fitted_on_pressed if pressed else subject.fitted
     finite, shown, numbers = _published(method, data.tests[name])
-    if not hasattr(method, "range_"):
-        return judged(finite, f"{shown}; it has no range of loads", **numbers)
-    if pressed and not method.needs_snapshots:
-        return judged(finite, f"{shown}; it is prepared for all directions", **numbers)
+    if not method.needs_snapshots and (pressed or not hasattr(method, "range_")):
+        return judged(finite, f"{shown}; it learns no range of loads", **numbers)
     unlike, larger = _unlike(name, data), name in LARGER
     try:
         flags, alarms = (
