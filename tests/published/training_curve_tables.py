@@ -22,10 +22,9 @@ FLATNESS = (
 """Headings of the cells of `flatness`."""
 
 
-def _by_method(source: str, methods: str) -> dict[str, Points]:
-    """Return the points of each method, or of the named ones, NAME,NAME,…."""
+def _by_method(source: str) -> dict[str, Points]:
     points: Points = content_of(source)["points"]
-    names = methods.split(",") if methods else dict.fromkeys(point["method"] for point in points)
+    names = dict.fromkeys(point["method"] for point in points)
     return {name: [point for point in points if point["method"] == name] for name in names}
 
 
@@ -58,10 +57,10 @@ def flatness(errors: Sequence[float]) -> list[str]:
     return [", ".join(f"{100 * fall:.0f}" for fall in falls), verdict]
 
 
-def training_iterations(source: str, methods: str = "") -> str:
+def training_iterations(source: str) -> str:
     """Show e of test samples over the iterations, with all training samples."""
     body, most = [], 0
-    for name, points in _by_method(source, methods).items():
+    for name, points in _by_method(source).items():
         whole = max(point["n_train"] for point in points)
         curve = _grouped([point for point in points if point["n_train"] == whole], "iterations")
         first, sets = min(curve), list(curve.values())
@@ -81,10 +80,10 @@ def training_iterations(source: str, methods: str = "") -> str:
     return markdown(headings, rows)
 
 
-def training_samples(source: str, methods: str = "") -> str:
+def training_samples(source: str) -> str:
     """Show e of test samples over the training samples; iterations are those of the files."""
     body, sizes = [], []
-    for name, points in _by_method(source, methods).items():
+    for name, points in _by_method(source).items():
         fewest = min(point["n_train"] for point in points)
         (usual,) = {point["iterations"] for point in points if point["n_train"] == fewest}
         curve = _grouped([point for point in points if point["iterations"] == usual], "n_train")
