@@ -14,11 +14,8 @@ from typing import Any
 
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from mor_bench.errors import MorBenchError
-
 MEMBERSHIP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 
-LEAST_ADDRESS_SPACE_BYTES = 2_000_000_000
 
 SIGNAL_CHECK_S = 0.2
 """Longest wait of the main thread, s.
@@ -118,23 +115,6 @@ def memory_limit_bytes(membership: Path = MEMBERSHIP, groups: Path = GROUPS) -> 
                     with suppress(OSError, ValueError):  # "max" is no limit
                         limits.append(float((place / name).read_text(encoding="ascii")))
     return min(limits)
-
-
-def check_address_space() -> None:
-    """Raise `MorBenchError` if this process may map less memory than numerical libraries need.
-
-    With less, OpenBLAS waits forever or ends the process without a word.
-    """
-    try:
-        import resource
-    except ImportError:  # Windows has no such limit
-        return
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if resource.RLIM_INFINITY != limit < LEAST_ADDRESS_SPACE_BYTES:
-        raise MorBenchError(
-            f"the address space must be at least {LEAST_ADDRESS_SPACE_BYTES / 1e9:g} GB; "
-            f"it is limited to {limit / 1e9:.3g} GB (ulimit -v)"
-        )
 
 
 def free_memory_bytes() -> float:

@@ -20,7 +20,8 @@ from typing import Any
 import psutil
 import pytest
 
-from mor_bench.machine import GROUPS, LEAST_ADDRESS_SPACE_BYTES, memory_limit_bytes
+from mor_bench.cli.address_space import LEAST_ADDRESS_SPACE_BYTES
+from mor_bench.machine import GROUPS, memory_limit_bytes
 from mor_bench.results.comparison import Comparison
 from mor_bench.sandbox.process import MEMORY_SHARE
 from tests.small_runs import COMMAND, descent_file, method_file, wait_for

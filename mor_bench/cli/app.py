@@ -11,6 +11,7 @@ import platformdirs
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from mor_bench.cli.address_space import check_address_space
 from mor_bench.cli.clear_errors import (
     StoppedBySignal,
     clear_errors,
@@ -19,7 +20,6 @@ from mor_bench.cli.clear_errors import (
 )
 from mor_bench.cli.clear_warnings import clear_warnings
 from mor_bench.cli.windows_job import end_children_with_this_process
-from mor_bench.machine import check_address_space
 
 COMMANDS = {
     "run": (
