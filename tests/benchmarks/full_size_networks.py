@@ -1,16 +1,16 @@
-"""Train networks in their authors' sizes on a graphics processor, and time their queries there.
+"""Train networks in their authors' sizes on a graphics processor, side by side.
 
     python -m tests.benchmarks.full_size_networks --json umesh-paper-size.json
 
 The datasets have the deformation of the paper of U-Mesh, the split is at random, and a batch has
-four samples, as in that paper. All trainings run side by side, each in its own stream, because one
-small batch does not fill a graphics processor. Times of queries are measured after all trainings.
+four samples, as in that paper. `umesh-small` has the batches of its file. All trainings run side by
+side, each in its own stream, because one small batch does not fill a graphics processor.
+`tests.benchmarks.gpu_queries` times queries.
 """
 
 from __future__ import annotations
 
 import json
-from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
@@ -24,14 +24,15 @@ import typer
 from numpy.typing import NDArray
 
 import mor_bench
-from mor_bench.learning.cuda_graphs import ReplayedNetwork, volumes_last
+from mor_bench.cli.fit_command import parse_hyperparameters
 from mor_bench.machine import gpu_name
 from mor_bench.measure.error_metrics import sample_errors, summary
 from mor_bench.report.published_figures import SCENES
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.store import write_atomically
-from mor_bench.surrogates.field_network import FieldNetwork, OperatorSurrogate
+from mor_bench.specs import load_dataset_spec
+from mor_bench.surrogates.field_network import OperatorSurrogate
 from mor_bench.training_options import TrainingOptions
 
 AT_THE_PAPERS_DEFORMATION = {
@@ -57,11 +58,16 @@ OTHERS: dict[str, dict[str, Any]] = {
         "batch_size": 4,
         "learning_rate": 1e-3,
     },
+    "umesh-small": {"inference": "cuda"},
 }
 """Other networks from the force, in the sizes of their authors or of their authors' code.
 
-`graph-u-net` has the width of the other graph network, and the levels of its file.
+`graph-u-net` has the width of the other graph network, and the levels of its file. `umesh-small`
+has the size of its file.
 """
+
+EXTRA_SEED = 1
+"""Seed of the loads of samples beyond those of a dataset."""
 
 SCORES = (
     "mean_dof_m",
@@ -75,7 +81,7 @@ SCORES = (
     "tip_rel_at_max_e",
     "tip_rel_at_largest",
 )
-N_QUERIES, N_WARM_UP, N_POINTS = 200, 20, 100
+N_POINTS = 100
 
 
 @dataclass
@@ -86,6 +92,8 @@ class Contestant:
     ----------
     method_name, name : str
         Names of the method and of the dataset.
+    train : Snapshots
+        Samples to learn from.
     method : Surrogate
     finished : SimpleQueue
         Receives this object when its training has ended.
@@ -100,6 +108,7 @@ class Contestant:
     method_name: str
     name: str
     data: Dataset
+    train: Snapshots
     method: Any
     finished: SimpleQueue[Contestant]
     started: Event = field(default_factory=Event)
@@ -110,7 +119,7 @@ class Contestant:
         begun = perf_counter()
         try:
             self.method.training = TrainingOptions(device="cuda", progress=self._progress)
-            self.method.fit(self.data.scene, without_validation(self.data))
+            self.method.fit(self.data.scene, self.train)
         except Exception as error:
             self.error = error
         self.seconds = perf_counter() - begun
@@ -125,12 +134,11 @@ class Contestant:
             )
 
 
-def without_validation(data: Dataset) -> Snapshots:
-    """Return the samples of training and validation; nothing is chosen by validation."""
-    parts = data.train, data.validation
+def joined(*parts: Snapshots) -> Snapshots:
+    """Return the samples of several sets in one."""
     loads = [part.loads for part in parts if isinstance(part.loads, PatchLoads)]
     return Snapshots(
-        data.scene,
+        parts[0].scene,
         PatchLoads(
             np.concatenate([load.patches for load in loads]),
             np.concatenate([load.vectors for load in loads]),
@@ -140,18 +148,6 @@ def without_validation(data: Dataset) -> Snapshots:
     )
 
 
-def queries_ms(function: Any, inputs: list[Any]) -> dict[str, float]:
-    """Return median and 95th percentile of the time of single queries, ms."""
-    times: list[float] = []
-    for query in range(N_WARM_UP + N_QUERIES):
-        given = inputs[query % len(inputs)]
-        begun = perf_counter()
-        function(given)
-        times.append(1e3 * (perf_counter() - begun))
-    kept = times[N_WARM_UP:]
-    return {"median": float(np.median(kept)), "p95": float(np.percentile(kept, 95))}
-
-
 def network_of(method: Any) -> Any:
     """Return a copy of the network, without what its `precompute` has left on the processor."""
     network = method.build_network({})
@@ -159,42 +155,17 @@ def network_of(method: Any) -> Any:
     return network.eval()
 
 
-@torch.inference_mode()
-def latency(contestant: Contestant) -> dict[str, Any]:
-    """Return the times of single queries: the network with and without replay, whole ones."""
-    method, forces = contestant.method, contestant.data.test.forces[:8]
-    network = network_of(method)
-    if isinstance(network, FieldNetwork):
-        features = network.encode(torch.from_numpy(forces.astype(np.float32)))
-        given = [features[i : i + 1] for i in range(len(features))]
-    else:
-        given = [torch.randn(1, *method.grid_.shape, 3).permute(0, 4, 1, 2, 3) for _ in forces]
-    on_device = volumes_last(deepcopy(network).to("cuda"))
-
-    def launched(inputs: torch.Tensor) -> torch.Tensor:
-        answer: torch.Tensor = on_device(inputs.to("cuda")).cpu()
-        return answer
-
-    found = {
-        "replayed": queries_ms(ReplayedNetwork(network), given),
-        "launched": queries_ms(launched, given),
-    }
-    if method.parameters.get("inference") == "cuda":
-        found["predict"] = queries_ms(method.predict, list(forces))
-    return found
-
-
-def scored(contestant: Contestant) -> dict[str, float]:
-    """Return the errors of all test samples, predicted on the graphics processor."""
-    method, test = contestant.method, contestant.data.test
+def scored(contestant: Contestant, samples: Snapshots) -> dict[str, float]:
+    """Return the errors of samples, predicted on the graphics processor."""
+    method = contestant.method
     if isinstance(method, OperatorSurrogate):
         network: Any = network_of(method).to("cuda")
         evaluate: Any = lambda fields: network(network.encode(fields.to("cuda"))).cpu()  # noqa: E731
         method.evaluate = evaluate  # type: ignore[method-assign]
     predicted: NDArray[np.float64] = np.concatenate(
-        [method.predict(test[i : i + 64].forces) for i in range(0, len(test), 64)]
+        [method.predict(samples[i : i + 64].forces) for i in range(0, len(samples), 64)]
     )
-    found = summary(sample_errors(predicted, test.displacements))
+    found = summary(sample_errors(predicted, samples.displacements))
     return {name: found[name] for name in SCORES}
 
 
@@ -205,21 +176,32 @@ def row_of(contestant: Contestant) -> dict[str, Any]:
     if contestant.error is not None:
         return row | {"error": repr(contestant.error)}
     curve = method.loss_curve_[:: max(1, len(method.loss_curve_) // N_POINTS)]
-    return row | {
+    row |= {
         **method.parameters,
         "n_weights": sum(weights.numel() for weights in method.network_.parameters()),
-        "n_train": len(data.train) + len(data.validation),
+        "n_train": len(contestant.train),
         "n_test": len(data.test),
         "fit_s": contestant.seconds,
         "loss_curve": [float(f"{loss:.4g}") for loss in curve],
-        "test": scored(contestant),
+        "test": scored(contestant, data.test),
     }
+    if _holds_out(method):
+        row["validation"] = scored(contestant, data.validation)
+    return row
 
 
-def contestant_of(text: str, iterations: int, finished: SimpleQueue[Contestant]) -> Contestant:
-    """Return the full-size network of [METHOD@]DATASET[:ITERATIONS], by default U-Mesh."""
-    method_name, _, rest = text.rpartition("@")
-    name, _, own = rest.partition(":")
+def contestant_of(
+    text: str, iterations: int, finished: SimpleQueue[Contestant], limit: int | None = None
+) -> Contestant:
+    """Return a network and its samples from [METHOD[KEY=VALUE]@]DATASET[:ITERATIONS[:SAMPLES]].
+
+    The method is U-Mesh by default. It learns from the samples of training and validation, without
+    a choice by validation, unless its file holds samples out. If SAMPLES is larger than their
+    number, the others have loads of another seed.
+    """
+    chosen, _, rest = text.rpartition("@")
+    method_name, _, own = chosen.removesuffix("]").partition("[")
+    name, *numbers = rest.split(":")
     if name not in AT_THE_PAPERS_DEFORMATION:
         known = ", ".join(AT_THE_PAPERS_DEFORMATION)
         raise typer.BadParameter(f"a dataset must be one of {known}; got {name!r}.")
@@ -228,54 +210,57 @@ def contestant_of(text: str, iterations: int, finished: SimpleQueue[Contestant])
     network = AT_THE_PAPERS_DEFORMATION[name].network
     umesh = {"channels": network.channels, "steps": network.steps, **UMESH}
     method_name = method_name or "umesh"
+    parameters = OTHERS.get(method_name, umesh) | parse_hyperparameters([own] if own else [])
     method = mor_bench.load_method(
-        method_name, **OTHERS.get(method_name, umesh), iterations=int(own or iterations)
+        method_name, **parameters, iterations=int(numbers[0]) if numbers else iterations
     )
-    data = mor_bench.load_dataset(name, split="sample")
-    return Contestant(method_name, name, data, method, finished)
+    data = mor_bench.load_dataset(name, split="sample", limit=limit)
+    train = data.train if _holds_out(method) else joined(data.train, data.validation)
+    if len(numbers) > 1:
+        train = joined(train, _more_samples(name, int(numbers[1]) - len(train)))
+    return Contestant(method_name, name, data, train, method, finished)
+
+
+def _holds_out(method: mor_bench.Surrogate) -> bool:
+    return float(method.parameters.get("validation_fraction", 0.0)) > 0.0
+
+
+def _more_samples(name: str, n: int) -> Snapshots:
+    """Return samples of a dataset with other loads."""
+    spec: Any = load_dataset_spec(name)
+    loads = spec.loads.model_copy(update={"samples": n, "seed": EXTRA_SEED})
+    data = mor_bench.load_dataset(spec.model_copy(update={"loads": loads}), split="sample")
+    return joined(data.train, data.validation, data.test)
 
 
 def main(
     scenes: Annotated[
         list[str] | None,
-        typer.Argument(help="[METHOD@]DATASET[:ITERATIONS]; by default U-Mesh on all datasets."),
+        typer.Argument(
+            help="[METHOD[KEY=VALUE]@]DATASET[:ITERATIONS[:SAMPLES]]; by default U-Mesh, all data."
+        ),
     ] = None,
     iterations: Annotated[int, typer.Option(help="By default as in the paper.")] = 100_000,
     report: Annotated[
         Path, typer.Option("--json", metavar="FILE", help="Write the rows here.")
     ] = Path("full-size-networks.json"),
 ) -> None:
-    """Train networks in their full sizes on a graphics processor, and time their queries there."""
+    """Train networks in their full sizes on a graphics processor."""
     torch.backends.cuda.matmul.allow_tf32 = True
+    torch.backends.cudnn.allow_tf32 = False  # for small networks; large ones train in bfloat16
     finished: SimpleQueue[Contestant] = SimpleQueue()
     names = scenes or list(AT_THE_PAPERS_DEFORMATION)
     for text in names:
         one = contestant_of(text, iterations, finished)
-        print(f"{text}: {len(one.data.train)} training samples", flush=True)
+        print(f"{text}: {len(one.train)} training samples", flush=True)
         Thread(target=one.fit, daemon=True).start()
         one.started.wait()  # one recording at a time
     found: dict[str, Any] = {"gpu": gpu_name(), "torch": torch.__version__, "rows": []}
-    ended = []
     for _ in names:
-        ended.append(finished.get())
-        found["rows"].append(row_of(ended[-1]))
-        _write(report, found)
-    for one, row in zip(ended, found["rows"], strict=True):
-        if one.error is None:
-            row["latency_ms"] = latency(one)
-    _write(report, found)
-
-
-def _write(report: Path, found: dict[str, Any]) -> None:
-    row = found["rows"][-1]
-    print(
-        row["method"],
-        row["dataset"],
-        row.get("error") or row["test"],
-        row.get("latency_ms"),
-        flush=True,
-    )
-    write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
+        row = row_of(finished.get())
+        found["rows"].append(row)
+        print(row["method"], row["dataset"], row.get("error") or row["test"], flush=True)
+        write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":
