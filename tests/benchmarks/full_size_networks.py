@@ -4,13 +4,14 @@
 
 The datasets have the deformation of the paper of U-Mesh, the split is at random, and a batch has
 four samples, as in that paper. `umesh-small` has the batches of its file. All trainings run side by
-side, each in its own stream, because one small batch does not fill a graphics processor.
-`tests.benchmarks.gpu_queries` times queries.
+side, each in its own stream, because one small batch does not fill a graphics processor. Times of
+queries are measured after all trainings.
 """
 
 from __future__ import annotations
 
 import json
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.cli.fit_command import parse_hyperparameters
+from mor_bench.learning.cuda_graphs import ReplayedNetwork, volumes_last
 from mor_bench.machine import gpu_name
 from mor_bench.measure.error_metrics import sample_errors, summary
 from mor_bench.report.published_figures import SCENES
@@ -32,7 +34,7 @@ from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import load_dataset_spec
-from mor_bench.surrogates.field_network import OperatorSurrogate
+from mor_bench.surrogates.field_network import FieldNetwork, OperatorSurrogate
 from mor_bench.training_options import TrainingOptions
 
 AT_THE_PAPERS_DEFORMATION = {
@@ -81,7 +83,7 @@ SCORES = (
     "tip_rel_at_max_e",
     "tip_rel_at_largest",
 )
-N_POINTS = 100
+N_QUERIES, N_WARM_UP, N_POINTS = 200, 20, 100
 
 
 @dataclass
@@ -148,11 +150,48 @@ def joined(*parts: Snapshots) -> Snapshots:
     )
 
 
+def queries_ms(function: Any, inputs: list[Any]) -> dict[str, float]:
+    """Return median and 95th percentile of the time of single queries, ms."""
+    times: list[float] = []
+    for query in range(N_WARM_UP + N_QUERIES):
+        given = inputs[query % len(inputs)]
+        begun = perf_counter()
+        function(given)
+        times.append(1e3 * (perf_counter() - begun))
+    kept = times[N_WARM_UP:]
+    return {"median": float(np.median(kept)), "p95": float(np.percentile(kept, 95))}
+
+
 def network_of(method: Any) -> Any:
     """Return a copy of the network, without what its `precompute` has left on the processor."""
     network = method.build_network({})
     network.load_state_dict(method.network_.state_dict(), assign=True)
     return network.eval()
+
+
+@torch.inference_mode()
+def latency(contestant: Contestant) -> dict[str, Any]:
+    """Return the times of single queries: the network with and without replay, whole ones."""
+    method, forces = contestant.method, contestant.data.test.forces[:8]
+    network = network_of(method)
+    if isinstance(network, FieldNetwork):
+        features = network.encode(torch.from_numpy(forces.astype(np.float32)))
+        given = [features[i : i + 1] for i in range(len(features))]
+    else:
+        given = [torch.randn(1, *method.grid_.shape, 3).permute(0, 4, 1, 2, 3) for _ in forces]
+    on_device = volumes_last(deepcopy(network).to("cuda"))
+
+    def launched(inputs: torch.Tensor) -> torch.Tensor:
+        answer: torch.Tensor = on_device(inputs.to("cuda")).cpu()
+        return answer
+
+    found = {
+        "replayed": queries_ms(ReplayedNetwork(network), given),
+        "launched": queries_ms(launched, given),
+    }
+    if method.parameters.get("inference") == "cuda":
+        found["predict"] = queries_ms(method.predict, list(forces))
+    return found
 
 
 def scored(contestant: Contestant, samples: Snapshots) -> dict[str, float]:
@@ -190,9 +229,7 @@ def row_of(contestant: Contestant) -> dict[str, Any]:
     return row
 
 
-def contestant_of(
-    text: str, iterations: int, finished: SimpleQueue[Contestant], limit: int | None = None
-) -> Contestant:
+def contestant_of(text: str, iterations: int, finished: SimpleQueue[Contestant]) -> Contestant:
     """Return a network and its samples from [METHOD[KEY=VALUE]@]DATASET[:ITERATIONS[:SAMPLES]].
 
     The method is U-Mesh by default. It learns from the samples of training and validation, without
@@ -214,7 +251,7 @@ def contestant_of(
     method = mor_bench.load_method(
         method_name, **parameters, iterations=int(numbers[0]) if numbers else iterations
     )
-    data = mor_bench.load_dataset(name, split="sample", limit=limit)
+    data = mor_bench.load_dataset(name, split="sample")
     train = data.train if _holds_out(method) else joined(data.train, data.validation)
     if len(numbers) > 1:
         train = joined(train, _more_samples(name, int(numbers[1]) - len(train)))
@@ -256,11 +293,19 @@ def main(
         Thread(target=one.fit, daemon=True).start()
         one.started.wait()  # one recording at a time
     found: dict[str, Any] = {"gpu": gpu_name(), "torch": torch.__version__, "rows": []}
+    ended = []
     for _ in names:
-        row = row_of(finished.get())
+        ended.append(finished.get())
+        row = row_of(ended[-1])
         found["rows"].append(row)
         print(row["method"], row["dataset"], row.get("error") or row["test"], flush=True)
         write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
+    torch.backends.cudnn.allow_tf32 = True
+    for one, row in zip(ended, found["rows"], strict=True):
+        if one.error is None:
+            row["latency_ms"] = latency(one)
+            print(row["method"], row["dataset"], row["latency_ms"], flush=True)
+    write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":

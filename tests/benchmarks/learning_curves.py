@@ -3,9 +3,10 @@
     python -m tests.benchmarks.learning_curves --json learning-curves.json
 
 Every point is a training of its own, with its own learning-rate schedule. The iterations double
-until two doublings in a row each lower the error on validation samples by less than 5 %, or until a
-training would take longer than the limit. Points that the file has already are not trained again,
-so that the same command continues after an interruption.
+until two doublings in a row each lower the error on validation samples by less than 5 %, but at
+least to the number in the method's file, or until a training would take longer than the limit.
+Points that the file has already are not trained again, so that the same command continues after an
+interruption.
 """
 
 from __future__ import annotations
@@ -156,7 +157,7 @@ class Curves:
             error = median(point["validation"]["mean_dof_m"] for point in found)
             core_s = median(point["core_s"] for point in found)
             n_flat = n_flat + 1 if error > (1 - FLAT) * before else 0
-            if n_flat == 2 or 2 * core_s > self.most_core_s:
+            if (n_flat >= 2 and share >= 1) or 2 * core_s > self.most_core_s:
                 break
             before = error
         self.of_all_seeds(method, n_train, usual)

@@ -37,11 +37,17 @@ SIZES = ((4, 2, 12_500), (8, 2, 12_500), (16, 2, 12_500), (32, 2, 6250), (8, 3, 
 PAPER = {"channels": 128, "steps": 3, "iterations": 12_500}
 """Size in the paper, and the number of iterations of 32 samples."""
 
+BATCH = 32
+"""Samples of a batch, in the file of the method."""
+
 HELD_OUT = {"channels": 32}
 """Rows that show how well laws that were fitted without them extrapolate."""
 
 LEAST_CHANNELS = 8
 """Smaller networks do not count for the laws: with 4 channels, they miss the size held out."""
+
+STARTS = (-2.0, -1.0, -0.3)
+"""Logarithms of floors over the smallest error, from which least squares start."""
 
 CONFIDENCE = 0.95
 
@@ -50,10 +56,12 @@ CONFIDENCE = 0.95
 class Law:
     """e = floor + exp(c · (1, log channels, log iterations, steps)), by least squares of log e.
 
+    The floor is 0, a constant, or a power of the channels.
+
     Attributes
     ----------
-    coefficients : (4,) or (5,) float64
-        c and, for a law with a floor, its logarithm; e in m.
+    coefficients : (4,), (5,) or (6,) float64
+        c and, for a law with a floor, its logarithm (at 1 channel) and its exponent; e in m.
     inverse : (n, n) float64
         Inverse of the normal matrix of the linearised law.
     deviation : float
@@ -104,26 +112,37 @@ def features(rows: Sequence[dict[str, Any]]) -> NDArray[np.float64]:
     )
 
 
-def _log_e(coefficients: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    power = x @ coefficients[:4]
-    return power if len(coefficients) == 4 else np.logaddexp(power, coefficients[4])
+def _log_floor(c: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return x[:, : len(c) - 4] @ c[4:]
 
 
-def _slopes(coefficients: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _log_e(c: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    power = x @ c[:4]
+    return power if len(c) == 4 else np.logaddexp(power, _log_floor(c, x))
+
+
+def _slopes(c: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the derivatives of log e by the coefficients, (n_rows, n_coefficients)."""
-    if len(coefficients) == 4:
+    if len(c) == 4:
         return x
-    share = np.exp(x @ coefficients[:4] - _log_e(coefficients, x))[:, None]
-    return np.hstack([share * x, 1.0 - share])
+    share = np.exp(x @ c[:4] - _log_e(c, x))[:, None]
+    return np.hstack([share * x, (1.0 - share) * x[:, : len(c) - 4]])
 
 
-def fit_law(rows: Sequence[dict[str, Any]], *, floor: bool) -> Law:
-    """Fit a law to the errors e of test samples, for networks that are large enough."""
+def fit_law(rows: Sequence[dict[str, Any]], n_floor: int) -> Law:
+    """Fit a law to the errors e of test samples, for networks that are large enough.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        Trainings.
+    n_floor : {0, 1, 2}
+        Number of coefficients of the floor: none, a constant, or a power of the channels.
+    """
     rows = [row for row in rows if row["channels"] >= LEAST_CHANNELS]
     x, y = features(rows), np.log([row["test"]["mean_dof_m"] for row in rows])
     found: Any = np.linalg.lstsq(x, y, rcond=None)[0]
-    if floor:
-        starts = [np.append(found, y.min() + below) for below in (-2.0, -1.0, -0.3)]
+    if n_floor:
 
         def error(c: NDArray[np.float64]) -> NDArray[np.float64]:
             return _log_e(c, x) - y
@@ -131,7 +150,8 @@ def fit_law(rows: Sequence[dict[str, Any]], *, floor: bool) -> Law:
         def slope(c: NDArray[np.float64]) -> NDArray[np.float64]:
             return _slopes(c, x)
 
-        fits = [least_squares(error, start, slope) for start in starts]
+        floors = [np.append(y.min() + below, np.zeros(n_floor - 1)) for below in STARTS]
+        fits = [least_squares(error, np.append(found, floor), slope) for floor in floors]
         found = min(fits, key=lambda fit: float(fit.cost)).x
     slopes = _slopes(found, x)
     inverse: Any = np.linalg.pinv(slopes.T @ slopes)
@@ -169,7 +189,7 @@ def main(
     data = mor_bench.load_dataset(dataset, split="sample")
     setting = {
         "dataset": dataset,
-        "batch_size": 32,
+        "batch_size": BATCH,
         "n_train": len(data.train),
         "largest_m": float(np.linalg.norm(data.test.displacements, axis=-1).max()),
     }

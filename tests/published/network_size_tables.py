@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from math import exp
 from typing import Any
 
 from mor_bench.report.number_format import number
 from mor_bench.report.published_figures import PUBLISHED, Published
-from tests.benchmarks.umesh_scaling import HELD_OUT, PAPER, fit_law
+from tests.benchmarks.umesh_scaling import BATCH, HELD_OUT, PAPER, Law, fit_law
 from tests.published.run_tables import markdown
 from tests.published.stored import content_of
 from tests.published.training_curve_tables import FLATNESS, flatness
@@ -41,15 +41,17 @@ MEASURED = {"dataset": "beam-coarse-paper", "channels": 128, "steps": 3}
 def network_sizes(source: str) -> str:
     """Show e of test samples by size of the network and number of iterations.
 
-    A training is flat by the rule of the learning curves, on validation samples.
+    SOURCE is FILE,FILE,…. A training is flat by the rule of the learning curves, on validation
+    samples.
     """
-    rows = content_of(source)["rows"]
+    rows = _small(_rows_of(source))
     numbers = sorted({row["iterations"] for row in rows})
     body = []
     for size in dict.fromkeys((row["channels"], row["steps"]) for row in rows):
         mine = {r["iterations"]: r for r in rows if (r["channels"], r["steps"]) == size}
         cells = [_metres(mine[n]["test"]["mean_dof_m"]) if n in mine else "–" for n in numbers]
         last = mine[max(mine)]
+        core_s = next(mine[n]["core_s"] for n in sorted(mine, reverse=True) if "core_s" in mine[n])
         errors = [mine[n]["validation"]["mean_dof_m"] for n in sorted(mine)]
         relative = number(100 * last["test"]["rel_l2_median"])
         body.append(
@@ -57,40 +59,42 @@ def network_sizes(source: str) -> str:
                 f"{size[0]}, {size[1]}",
                 *cells,
                 relative,
-                number(last["core_s"]),
+                number(core_s),
                 *flatness(errors),
             ]
         )
     headings = ["channels, steps", *(f"{n:,} iterations" for n in numbers)]
-    return markdown([*headings, "median % of the last", "core-s of the last", *FLATNESS], body)
+    headings += ["median % of the last", "core-s of the last on a processor"]
+    return markdown([*headings, *FLATNESS], body)
 
 
 def network_size_law(source: str) -> str:
-    """Show two scaling laws, how well they extrapolate, and what they say of the paper's size.
+    """Show three scaling laws, how well they extrapolate, and what they say of the paper's size.
 
-    SOURCE is FILE,FILE: trainings in many sizes, and one in the paper's size, whose batches may
-    differ, so it counts by its number of samples.
+    SOURCE is FILE,FILE,…: small networks, and some in the paper's size, whose batches differ, so
+    they count by their number of samples.
     """
-    many, paper = map(content_of, source.split(","))
-    rows = many["rows"]
-    (large,) = [row for row in paper["rows"] if MEASURED.items() <= row.items()]
-    seen = round(large["iterations"] * large["batch_size"] / many["batch_size"])
-    size = {name: large[name] for name in ("channels", "steps")} | {"iterations": seen}
+    every = _rows_of(source)
+    rows = _small(every)
     held_out = [row for row in rows if HELD_OUT.items() <= row.items()]
     others = [row for row in rows if row not in held_out]
-    columns = [_law_cells(rows, others, held_out, size, floor=floor) for floor in (False, True)]
+    large = [row for row in every if MEASURED.items() <= row.items()]
+    sizes = [
+        {**MEASURED, "iterations": round(r["iterations"] * r["batch_size"] / BATCH)} for r in large
+    ]
+    columns = [_law_cells(rows, others, held_out, sizes, n_floor) for n_floor in range(3)]
     names = ["exponent of the channels", "exponent of the iterations", "factor of a further step"]
-    names += ["floor, m", "standard deviation of log e", "AICc (less is better)"]
+    names += ["floor, m", "exponent of the channels in the floor"]
+    names += ["standard deviation of log e", "AICc (less is better)"]
     for row in held_out:
-        measured = _metres(row["test"]["mean_dof_m"])
         name = f"e at {row['channels']} channels, {row['iterations']:,} iterations, m"
-        names.append(f"{name}, from the other sizes; measured {measured}")
-    name = f"e at {PAPER['channels']} channels, {PAPER['steps']} steps, "
-    measured = _metres(large["test"]["mean_dof_m"])
-    names.append(f"{name}{seen:,} iterations, m, extrapolated; measured {measured}")
-    names.append(f"{name}as many samples as in the paper, m; in the paper {_metres(PAPER_E_M)}")
+        names.append(f"{name}, from the other sizes; measured {_metres(row['test']['mean_dof_m'])}")
+    for row, size in zip(large, sizes, strict=True):
+        name = f"e at {size['channels']} channels, {size['steps']} steps, {size['iterations']:,} "
+        measured = _metres(row["test"]["mean_dof_m"])
+        names.append(f"{name}iterations, m, extrapolated; measured {measured}")
     body = [list(cells) for cells in zip(names, *columns, strict=True)]
-    return markdown(["", "power law", "power law above a floor"], body)
+    return markdown(["", "power law", "above a floor", "above a power of the channels"], body)
 
 
 def paper_size(source: str) -> str:
@@ -100,6 +104,8 @@ def paper_size(source: str) -> str:
     """
     body = []
     for row in _rows_of(source):
+        if row.get("method", "umesh") != "umesh":
+            continue
         test, paper = row["test"], _published(row)
         body.append(
             [
@@ -180,7 +186,14 @@ def training_speed(source: str) -> str:
 
 
 def _rows_of(source: str) -> Rows:
-    return [row for name in source.split(",") for row in content_of(name)["rows"]]
+    """Return the rows of several files, without those of trainings that failed."""
+    files = [content_of(name) for name in source.split(",")]
+    rows = [{"batch_size": file.get("batch_size"), **row} for file in files for row in file["rows"]]
+    return [row for row in rows if "error" not in row]
+
+
+def _small(rows: Rows) -> Rows:
+    return [row for row in rows if row["batch_size"] == BATCH]
 
 
 def _published(row: dict[str, Any]) -> Published:
@@ -198,24 +211,24 @@ def _beside(ours: float, published: float | None) -> str:
     return f"{_metres(ours)} / {'–' if published is None else _metres(published)}"
 
 
-def _law_cells(
-    rows: Rows, others: Rows, held_out: Rows, large: dict[str, int], *, floor: bool
-) -> list[str]:
+def _law_cells(rows: Rows, others: Rows, held_out: Rows, large: Rows, n_floor: int) -> list[str]:
     """Return the cells of one law: all rows fit it, and the others alone for those held out."""
-    law, without = fit_law(rows, floor=floor), fit_law(others, floor=floor)
+    law, without = fit_law(rows, n_floor), fit_law(others, n_floor)
     c = law.coefficients
     cells = [f"{_ratio(c[i])} ({_pair(law.interval(i), _ratio)})" for i in (1, 2)]
-    for i, text in ((3, _ratio), (4, _metres)):
-        if i < len(c):
-            low, high = map(exp, law.interval(i))
-            cells.append(f"{text(exp(c[i]))} ({_pair((low, high), text)})")
-        else:
-            cells.append("–")
+    cells.append(_factor(law, 3, _ratio))
+    cells.append(_factor(law, 4, _metres) if n_floor == 1 else "–")
+    cells.append(f"{_ratio(c[5])} ({_pair(law.interval(5), _ratio)})" if n_floor == 2 else "–")
     cells += [_ratio(law.deviation), f"{law.aicc:.0f}"]
-    for known, row in [*((without, row) for row in held_out), (law, large), (law, PAPER)]:
+    for known, row in [*((without, row) for row in held_out), *((law, row) for row in large)]:
         e, *ends = known.predict(row)
         cells.append(f"{_metres(e)} ({_pair(ends, _metres)})")
     return cells
+
+
+def _factor(law: Law, which: int, text: Callable[[float], str]) -> str:
+    """Return the exponential of a coefficient with its confidence interval."""
+    return f"{text(exp(law.coefficients[which]))} ({_pair(map(exp, law.interval(which)), text)})"
 
 
 def _ratio(value: float) -> str:
@@ -226,5 +239,5 @@ def _metres(value: float) -> str:
     return f"{value:.1e}".replace("e-0", "e-")
 
 
-def _pair(ends: Sequence[float], text: Callable[[float], str]) -> str:
+def _pair(ends: Iterable[float], text: Callable[[float], str]) -> str:
     return " to ".join(map(text, ends))

@@ -54,7 +54,7 @@ def flatness(errors: Sequence[float]) -> list[str]:
         verdict = "rises"
     else:
         verdict = "yes" if len(falls) == 2 and max(falls) < FLAT else "no"
-    return [", ".join(f"{100 * fall:.0f}" for fall in falls), verdict]
+    return [", ".join(f"{100 * fall:.1f}" for fall in falls), verdict]
 
 
 def training_iterations(source: str) -> str:
