@@ -49,8 +49,24 @@ METHODS: dict[str, dict[str, Any]] = {
     "latent-lspg": {},
     "pod-nn-derivative": {},
     "pod-nn-ensemble": {},
+    "pca-regression-linear": {},
+    "pca-ridge": {},
+    "pca-kernel-ridge": {},
+    "pca-gaussian-process": {},
+    "pca-random-forest": {},
+    "pca-extra-trees": {},
+    "sparse-polynomial": {},
+    "sparse-polynomial-derivative": {},
+    "pgd-snapshots": {},
+    "pca-regression": {},
+    "pca-polynomial-force": {},
+    "sparse-polynomial-force": {},
+    "pgd-snapshots-force": {},
 }
-"""Methods, and parameters that replace those of their files."""
+"""Methods, and parameters that replace those of their files.
+
+Those without iterations are fitted to the numbers of samples alone, once for each.
+"""
 
 BY_DEFAULT = ["pod-nn", "autoencoder", "pod-deeponet", "deeponet"]
 
@@ -65,12 +81,21 @@ FLAT = 0.05
 
 @dataclass(frozen=True)
 class Point:
-    """A training: all but the seed says where it stands on a curve."""
+    """A training: all but the seed says where it stands on a curve.
+
+    A method without iterations has none, and one seed.
+    """
 
     method: str
     n_train: int
     iterations: int
     seed: int = 0
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters of the method."""
+        drawn = {"iterations": self.iterations, "seed": self.seed} if self.iterations else {}
+        return METHODS[self.method] | drawn
 
 
 @cache
@@ -81,14 +106,13 @@ def dataset_of(name: str) -> Dataset:
 def trained(dataset: str, wanted: Point) -> dict[str, Any]:
     """Return a point with its core-seconds and its errors of validation and test."""
     data = dataset_of(dataset)
-    parameters = METHODS[wanted.method]
     train = data.train[: wanted.n_train]
     with pinned_threads(1):
         # Kernels are compiled before the training that is timed.
-        mor_bench.load_method(wanted.method, **parameters, iterations=1).fit(data.scene, train[:64])
-        made = mor_bench.load_method(
-            wanted.method, **parameters, iterations=wanted.iterations, seed=wanted.seed
-        )
+        short = {"iterations": 1} if wanted.iterations else {}
+        first = mor_bench.load_method(wanted.method, **(wanted.parameters | short))
+        first.fit(data.scene, train[:64])
+        made = mor_bench.load_method(wanted.method, **wanted.parameters)
         begun = process_time()
         made.fit(data.scene, train)
         return {
@@ -129,7 +153,8 @@ class Curves:
 
     def of_all_seeds(self, method: str, n_train: int, iterations: int) -> list[dict[str, Any]]:
         """Return the points of all seeds; train for those that are not known."""
-        wanted = [Point(method, n_train, iterations, seed) for seed in SEEDS]
+        seeds = SEEDS if iterations else SEEDS[:1]
+        wanted = [Point(method, n_train, iterations, seed) for seed in seeds]
         unknown = [one for one in wanted if self._known(one) is None]
         running = [self.trainings.submit(trained, self.dataset, one) for one in unknown]
         for one in running:
@@ -183,9 +208,10 @@ def main(
         curves.read()
         running: list[Future[Any]] = []
         for name in method:
-            usual = int(load_method_spec(name).parameters["iterations"])
-            running.append(waiting.submit(curves.iterate, name, whole, usual))
-            for n_train in SAMPLES:
+            usual = int(load_method_spec(name).parameters.get("iterations", 0))
+            if usual:
+                running.append(waiting.submit(curves.iterate, name, whole, usual))
+            for n_train in SAMPLES if usual else (*SAMPLES, whole):
                 running.append(waiting.submit(curves.of_all_seeds, name, n_train, usual))
         for one in running:
             one.result()

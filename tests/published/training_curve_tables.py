@@ -23,9 +23,13 @@ FLATNESS = (
 
 
 def _by_method(source: str) -> dict[str, Points]:
-    points: Points = content_of(source)["points"]
-    names = dict.fromkeys(point["method"] for point in points)
-    return {name: [point for point in points if point["method"] == name] for name in names}
+    """Return the points of each method from the last of several files that has it."""
+    found: dict[str, Points] = {}
+    for name in source.split(","):
+        points: Points = content_of(name)["points"]
+        methods = dict.fromkeys(point["method"] for point in points)
+        found |= {method: [p for p in points if p["method"] == method] for method in methods}
+    return found
 
 
 def _grouped(points: Points, key: str) -> dict[int, Points]:
@@ -38,6 +42,8 @@ def _error(points: Points, part: str = "test") -> float:
 
 
 def _cell(points: Points) -> str:
+    if len(points) == 1:
+        return f"{_error(points):.1e}".replace("e-0", "e-")
     errors = sorted(point["test"]["mean_dof_m"] for point in points)
     low, high = (f"{value:.1e}".replace("e-0", "e-") for value in (errors[0], errors[-1]))
     return f"{_error(points):.1e} ({low} to {high})".replace("e-0", "e-")
@@ -58,7 +64,10 @@ def flatness(errors: Sequence[float]) -> list[str]:
 
 
 def training_iterations(source: str) -> str:
-    """Show e of test samples over the iterations, with all training samples."""
+    """Show e of test samples over the iterations, with all training samples.
+
+    SOURCE is FILE,FILE,…. The method with the least e of its longest training comes first.
+    """
     body, most = [], 0
     for name, points in _by_method(source).items():
         whole = max(point["n_train"] for point in points)
@@ -70,27 +79,31 @@ def training_iterations(source: str) -> str:
         seconds = float(median(point["core_s"] for point in sets[-1]))
         last = [number(100 * float(relative)), number(seconds)]
         verdict = flatness([_error(part, "validation") for part in sets])
-        body.append(([f"`{name}`", f"{first:,}"], cells, last + verdict))
+        body.append((_error(sets[-1]), [f"`{name}`", f"{first:,}"], cells, last + verdict))
     headings = ["method", "first number of iterations", "e with it, m"]
     headings += [f"with {2**i} times as many" for i in range(1, most + 1)]
     headings += ["median % of the last", "core-s of the last", *FLATNESS]
     rows = [
-        start + [cells.get(i, "–") for i in range(most + 1)] + end for start, cells, end in body
+        start + [cells.get(i, "–") for i in range(most + 1)] + end
+        for _, start, cells, end in sorted(body, key=lambda row: row[0])
     ]
     return markdown(headings, rows)
 
 
 def training_samples(source: str) -> str:
-    """Show e of test samples over the training samples; iterations are those of the files."""
+    """Show e of test samples over the training samples; iterations are those of the files.
+
+    SOURCE is FILE,FILE,…. The method with the least e with all samples comes first.
+    """
     body, sizes = [], []
     for name, points in _by_method(source).items():
         fewest = min(point["n_train"] for point in points)
         (usual,) = {point["iterations"] for point in points if point["n_train"] == fewest}
         curve = _grouped([point for point in points if point["iterations"] == usual], "n_train")
         sizes = list(curve)
-        seconds = median(point["core_s"] for point in curve[sizes[-1]])
-        body.append(
-            [f"`{name}`", f"{usual:,}", *map(_cell, curve.values()), number(float(seconds))]
-        )
+        seconds = float(median(point["core_s"] for point in curve[sizes[-1]]))
+        cells = [f"`{name}`", f"{usual:,}" if usual else "–", *map(_cell, curve.values())]
+        body.append((_error(curve[sizes[-1]]), [*cells, number(seconds)]))
     headings = ["method", "iterations", *(f"e with {n:,} samples, m" for n in sizes)]
-    return markdown([*headings, f"core-s with {sizes[-1]:,}"], body)
+    rows = [cells for _, cells in sorted(body, key=lambda row: row[0])]
+    return markdown([*headings, f"core-s with {sizes[-1]:,}"], rows)
