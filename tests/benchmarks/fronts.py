@@ -5,8 +5,7 @@
 Each version runs its own `mor-bench run` on the same scenes and the same loads, with the default
 configurations of its methods. Test sets out of range are left out, because the earlier version does
 not know all of them. Networks are left out, because their errors depend on the length of the
-training. The regression has another name today, which says what it is told. Without an earlier
-commit, methods run that it did not have, with `linear-fem` for comparison of the two runs.
+training. The regression has another name today, which says what it is told.
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ SCENES = (
 )
 BEFORE = ("fem", "linear-fem", "pod", "hpod", "pca-regression", "sparse-polynomial", "pod-nn")
 NOW = ("fem", "linear-fem", "pod", "hpod", "pca-regression-linear", "sparse-polynomial", "pod-nn")
-NEW = ("linear-fem", "quadratic-manifold-pod", "pod-ann")
 
 TEST_SETS = re.compile(r"^\[tests\]\n(?:[^\[\n].*\n|\n)*", re.MULTILINE)
 ERRORS = ("rel_l2_median", "rel_l2_p95", "rel_l2_max")
@@ -70,27 +68,23 @@ def rows_of(code: Path, methods: tuple[str, ...], limit: int, folder: Path) -> l
 
 
 def main(
-    commit: Annotated[str | None, typer.Argument(help="The earlier commit.")] = None,
+    commit: Annotated[str, typer.Argument(help="The earlier commit.")],
     limit: Annotated[int, typer.Option(help="Samples of each scene.")] = 400,
     report: Annotated[
         Path, typer.Option("--json", metavar="FILE", help="Write the rows here.")
     ] = Path("fronts.json"),
 ) -> None:
-    """Compare methods as they were at an earlier commit with today's, or run the new ones."""
-    found: dict[str, Any] = {"commit": commit, "limit": limit, "before": []}
+    """Compare methods as they were at an earlier commit with the same methods today."""
+    found: dict[str, Any] = {"commit": commit, "limit": limit}
     with TemporaryDirectory() as text:
         folder = Path(text)
-        if commit is None:
-            found["now"] = rows_of(ROOT, NEW, limit, folder / "now")
-        else:
-            old = folder / "code"
-            git = ["git", "worktree"]
-            subprocess.run([*git, "add", "--detach", old, commit], cwd=ROOT, check=True)
-            try:
-                found["before"] = rows_of(old, BEFORE, limit, folder / "before")
-                found["now"] = rows_of(ROOT, NOW, limit, folder / "now")
-            finally:
-                subprocess.run([*git, "remove", "--force", old], cwd=ROOT, check=True)
+        old = folder / "code"
+        subprocess.run(["git", "worktree", "add", "--detach", old, commit], cwd=ROOT, check=True)
+        try:
+            found["before"] = rows_of(old, BEFORE, limit, folder / "before")
+            found["now"] = rows_of(ROOT, NOW, limit, folder / "now")
+        finally:
+            subprocess.run(["git", "worktree", "remove", "--force", old], cwd=ROOT, check=True)
     write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
 
 
