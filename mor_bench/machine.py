@@ -81,12 +81,23 @@ def _libraries() -> ThreadpoolController:
 
 
 @contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Let BLAS use one thread.
+
+    Its threads wait for each other in every one of many small products. Beside other programs, each
+    wait can last until the system's scheduler runs all of them again.
+    """
+    with _libraries().limit(limits=1, user_api="blas"):
+        yield
+
+
+@contextmanager
 def kernels_alone() -> Iterator[None]:
     """Let BLAS use one thread where kernels use more: its waiting threads would slow them down."""
     if _kernel_threads == 1:
         yield
         return
-    with _libraries().limit(limits=1, user_api="blas"):
+    with one_blas_thread():
         yield
 
 

@@ -21,6 +21,7 @@ from mor_bench.errors import (
     NoEquilibriumError,
     SolverError,
 )
+from mor_bench.machine import one_blas_thread
 from mor_bench.mechanics.accelerated import accelerated, run_in_step
 from mor_bench.mechanics.linear import NotPositiveDefiniteError
 from mor_bench.mechanics.load_steps import LoadSteps
@@ -267,7 +268,10 @@ def solve_equilibria(
             continue
         spent = first.iterations if first else 0
         try:
-            found: Solution | SolverError = _by_newton(problem, loads[i], starts[i], options, spent)
+            with one_blas_thread():
+                found: Solution | SolverError = _by_newton(
+                    problem, loads[i], starts[i], options, spent
+                )
         except SolverError as error:
             found = error
         yield i, found

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import mor_bench
 from mor_bench.errors import (
@@ -202,6 +203,28 @@ def test_one_huge_step_is_cut_back_and_ends_where_small_steps_do() -> None:
     few = NewtonOptions(max_cuts=3)
     with pytest.raises(SolverError, match="4 cut-backs"):
         solve_equilibrium(confined_column(), np.array([3 * LIMIT_PA]), options=few)
+
+
+def test_newton_keeps_blas_to_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside other programs, more threads made a query last half a minute instead of a second."""
+    seen: list[int] = []
+
+    def blas_threads() -> list[int]:
+        return [one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"]
+
+    def factored(self: BandedCholesky, values: Array) -> Any:
+        seen.extend(blas_threads())
+        return original(self, values)
+
+    scene = scene_of("neo-hookean", ("hexahedron", False))
+    model, load = FullOrderModel(scene), patch_load(scene, -1, [-20.0, 0.0, -20.0])
+    model.solve(1e-3 * load)  # factors the stiffness at rest
+    original = BandedCholesky.factor
+    monkeypatch.setattr(BandedCholesky, "factor", factored)
+    with threadpool_limits(2, user_api="blas"):
+        model.solve(load)
+        assert set(blas_threads()) == {2}
+    assert set(seen) == {1}
 
 
 @pytest.mark.parametrize(
