@@ -44,7 +44,7 @@ HELD_OUT = {"channels": 32}
 """Rows that show how well laws that were fitted without them extrapolate."""
 
 LEAST_CHANNELS = 8
-"""Smaller networks do not count for the laws: with 4 channels, they miss the size held out."""
+"""Smaller networks do not count for the laws: with 4 channels, they missed the size held out."""
 
 STARTS = (-2.0, -1.0, -0.3)
 """Logarithms of floors over the smallest error, from which least squares start."""
@@ -129,7 +129,9 @@ def _slopes(c: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float6
     return np.hstack([share * x, (1.0 - share) * x[:, : len(c) - 4]])
 
 
-def fit_law(rows: Sequence[dict[str, Any]], n_floor: int) -> Law:
+def fit_law(
+    rows: Sequence[dict[str, Any]], n_floor: int, least_channels: int = LEAST_CHANNELS
+) -> Law:
     """Fit a law to the errors e of test samples, for networks that are large enough.
 
     Parameters
@@ -138,8 +140,10 @@ def fit_law(rows: Sequence[dict[str, Any]], n_floor: int) -> Law:
         Trainings.
     n_floor : {0, 1, 2}
         Number of coefficients of the floor: none, a constant, or a power of the channels.
+    least_channels : int
+        Smaller networks do not count.
     """
-    rows = [row for row in rows if row["channels"] >= LEAST_CHANNELS]
+    rows = [row for row in rows if row["channels"] >= least_channels]
     x, y = features(rows), np.log([row["test"]["mean_dof_m"] for row in rows])
     found: Any = np.linalg.lstsq(x, y, rcond=None)[0]
     if n_floor:

@@ -51,7 +51,7 @@ def network_sizes(source: str) -> str:
         mine = {r["iterations"]: r for r in rows if (r["channels"], r["steps"]) == size}
         cells = [_metres(mine[n]["test"]["mean_dof_m"]) if n in mine else "–" for n in numbers]
         last = mine[max(mine)]
-        core_s = next(mine[n]["core_s"] for n in sorted(mine, reverse=True) if "core_s" in mine[n])
+        most = max(n for n in mine if "core_s" in mine[n])
         errors = [mine[n]["validation"]["mean_dof_m"] for n in sorted(mine)]
         relative = number(100 * last["test"]["rel_l2_median"])
         body.append(
@@ -59,12 +59,12 @@ def network_sizes(source: str) -> str:
                 f"{size[0]}, {size[1]}",
                 *cells,
                 relative,
-                number(core_s),
+                f"{number(mine[most]['core_s'])} ({most:,})",
                 *flatness(errors),
             ]
         )
     headings = ["channels, steps", *(f"{n:,} iterations" for n in numbers)]
-    headings += ["median % of the last", "core-s of the last on a processor"]
+    headings += ["median % of the last", "core-s on a processor (iterations)"]
     return markdown([*headings, *FLATNESS], body)
 
 
@@ -93,6 +93,7 @@ def network_size_law(source: str) -> str:
         name = f"e at {size['channels']} channels, {size['steps']} steps, {size['iterations']:,} "
         measured = _metres(row["test"]["mean_dof_m"])
         names.append(f"{name}iterations, m, extrapolated; measured {measured}")
+    names += ["the last but one with 4 channels, too", "the last with 4 channels, too"]
     body = [list(cells) for cells in zip(names, *columns, strict=True)]
     return markdown(["", "power law", "above a floor", "above a power of the channels"], body)
 
@@ -221,9 +222,14 @@ def _law_cells(rows: Rows, others: Rows, held_out: Rows, large: Rows, n_floor: i
     cells.append(f"{_ratio(c[5])} ({_pair(law.interval(5), _ratio)})" if n_floor == 2 else "–")
     cells += [_ratio(law.deviation), f"{law.aicc:.0f}"]
     for known, row in [*((without, row) for row in held_out), *((law, row) for row in large)]:
-        e, *ends = known.predict(row)
-        cells.append(f"{_metres(e)} ({_pair(ends, _metres)})")
-    return cells
+        cells.append(_predicted(known, row))
+    every = fit_law(rows, n_floor, least_channels=1)
+    return [*cells, *(_predicted(every, row) for row in large)]
+
+
+def _predicted(law: Law, row: dict[str, Any]) -> str:
+    e, *ends = law.predict(row)
+    return f"{_metres(e)} ({_pair(ends, _metres)})"
 
 
 def _factor(law: Law, which: int, text: Callable[[float], str]) -> str:
