@@ -6,8 +6,6 @@ import json
 import re
 from typing import Any
 
-import pytest
-
 from mor_bench.analysis.told import class_text, given_by
 from mor_bench.report.entries import verdict_of
 from mor_bench.report.suite_overview import overview
