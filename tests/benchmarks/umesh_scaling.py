@@ -34,9 +34,6 @@ ITERATIONS = (780, 1560, 3125, 6250, 12_500)
 SIZES = ((4, 2, 12_500), (8, 2, 12_500), (16, 2, 12_500), (32, 2, 6250), (8, 3, 3125))
 """Channels, steps, and the largest number of iterations."""
 
-PAPER = {"channels": 128, "steps": 3, "iterations": 12_500}
-"""Size in the paper, and the number of iterations of 32 samples."""
-
 BATCH = 32
 """Samples of a batch, in the file of the method."""
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from mor_bench.report.number_format import number
 from mor_bench.report.published_figures import PUBLISHED, Published
-from tests.benchmarks.umesh_scaling import BATCH, HELD_OUT, PAPER, Law, fit_law
+from tests.benchmarks.umesh_scaling import BATCH, HELD_OUT, Law, fit_law
 from tests.published.run_tables import markdown
 from tests.published.stored import content_of
 from tests.published.training_curve_tables import FLATNESS, flatness
@@ -16,13 +16,6 @@ from tests.published.training_curve_tables import FLATNESS, flatness
 PARTS = ("forward", "backward", "optimiser")
 
 Rows = list[dict[str, Any]]
-
-PAPER_E_M = next(
-    row.mean_m
-    for row in PUBLISHED
-    if (row.dataset, row.channels, row.steps) == ("beam-coarse", PAPER["channels"], PAPER["steps"])
-)
-"""Mean error on the coarse beam in the paper, for the network that is extrapolated to, m."""
 
 ENDS = ("median", "p95", "max")
 
