@@ -42,11 +42,13 @@ def _error(points: Points, part: str = "test") -> float:
 
 
 def _cell(points: Points) -> str:
+    """Return the median, and the range in the median's power of ten."""
+    middle = f"{_error(points):.1e}".replace("e-0", "e-")
     if len(points) == 1:
-        return f"{_error(points):.1e}".replace("e-0", "e-")
+        return middle
     errors = sorted(point["test"]["mean_dof_m"] for point in points)
-    low, high = (f"{value:.1e}".replace("e-0", "e-") for value in (errors[0], errors[-1]))
-    return f"{_error(points):.1e} ({low} to {high})".replace("e-0", "e-")
+    unit = float("1e" + middle.partition("e")[2])
+    return f"{middle} ({errors[0] / unit:.1f} to {errors[-1] / unit:.1f})"
 
 
 def flatness(errors: Sequence[float]) -> list[str]:
