@@ -25,7 +25,6 @@ import typer
 from numpy.typing import NDArray
 
 import mor_bench
-from mor_bench.cli.fit_command import parse_hyperparameters
 from mor_bench.learning.cuda_graphs import ReplayedNetwork, volumes_last
 from mor_bench.machine import gpu_name
 from mor_bench.measure.error_metrics import sample_errors, summary
@@ -34,6 +33,7 @@ from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import load_dataset_spec
+from mor_bench.specs.inline_parameters import split_method
 from mor_bench.surrogates.field_network import FieldNetwork, OperatorSurrogate
 from mor_bench.training_options import TrainingOptions
 
@@ -233,28 +233,30 @@ def contestant_of(text: str, iterations: int, finished: SimpleQueue[Contestant])
     """Return a network and its samples from [METHOD[KEY=VALUE]@]DATASET[:ITERATIONS[:SAMPLES]].
 
     The method is U-Mesh by default. It learns from the samples of training and validation, without
-    a choice by validation, unless its file holds samples out. If SAMPLES is larger than their
-    number, the others have loads of another seed.
+    a choice by validation, unless its file holds samples out. Those that SAMPLES has beyond their
+    number have loads of another seed.
     """
     chosen, _, rest = text.rpartition("@")
-    method_name, _, own = chosen.removesuffix("]").partition("[")
+    method_name, _ = split_method(chosen or "umesh")
     name, *numbers = rest.split(":")
     if name not in AT_THE_PAPERS_DEFORMATION:
         known = ", ".join(AT_THE_PAPERS_DEFORMATION)
         raise typer.BadParameter(f"a dataset must be one of {known}; got {name!r}.")
-    if method_name and method_name not in OTHERS:
-        raise typer.BadParameter(f"a method must be one of {list(OTHERS)}; got {method_name!r}.")
+    known_methods = ["umesh", *OTHERS]
+    if method_name not in known_methods:
+        raise typer.BadParameter(f"a method must be one of {known_methods}; got {method_name!r}.")
     network = AT_THE_PAPERS_DEFORMATION[name].network
     umesh = {"channels": network.channels, "steps": network.steps, **UMESH}
-    method_name = method_name or "umesh"
-    parameters = OTHERS.get(method_name, umesh) | parse_hyperparameters([own] if own else [])
+    parameters = OTHERS.get(method_name, umesh)
     method = mor_bench.load_method(
-        method_name, **parameters, iterations=int(numbers[0]) if numbers else iterations
+        chosen or "umesh", **parameters, iterations=int(numbers[0]) if numbers else iterations
     )
     data = mor_bench.load_dataset(name, split="sample")
     train = data.train if _holds_out(method) else joined(data.train, data.validation)
     if len(numbers) > 1:
-        train = joined(train, _more_samples(name, int(numbers[1]) - len(train)))
+        if (more := int(numbers[1]) - len(train)) < 1:
+            raise typer.BadParameter(f"SAMPLES must exceed {len(train)}; got {numbers[1]}.")
+        train = joined(train, _more_samples(name, more))
     return Contestant(method_name, name, data, train, method, finished)
 
 
