@@ -267,7 +267,8 @@ def _holds_out(method: mor_bench.Surrogate) -> bool:
 def _more_samples(name: str, n: int) -> Snapshots:
     """Return samples of a dataset with other loads."""
     spec: Any = load_dataset_spec(name)
-    loads = spec.loads.model_copy(update={"samples": n, "seed": EXTRA_SEED})
+    number = {"samples": n, "samples_per_patch": None}
+    loads = spec.loads.model_copy(update={**number, "seed": EXTRA_SEED})
     data = mor_bench.load_dataset(spec.model_copy(update={"loads": loads}), split="sample")
     return joined(data.train, data.validation, data.test)
 
