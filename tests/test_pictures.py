@@ -280,14 +280,14 @@ def test_labels_cover_neither_marks_nor_each_other() -> None:
         assert not any(box.overlaps(other) for other in boxes[:i])
 
 
-def test_loss_curves_tell_whether_training_had_ended(tmp_path: Path) -> None:
+def test_loss_curves_tell_whether_the_loss_still_falls(tmp_path: Path) -> None:
     rows = Comparison(tmp_path, {})
     training = {"seed": 0, "iterations": 100, "loss": 1.0, "device": "cpu"}
     row = a_row("umesh", dataset="beam", training=training)
     rows.put(row, {"loss_curve": np.geomspace(1.0, 1e-4, 100), "validation_curve": np.ones(20)})
     picture = loss_curves(rows, "beam")
     assert picture is not None
-    assert "levelled off" in picture.finding
+    assert picture.finding == "No loss falls by more than 5 % in the last tenth of its training"
     rows.put(row, {"loss_curve": np.geomspace(1.0, 1e-4, 100)})
     picture = loss_curves(rows, "beam")
     assert picture is not None

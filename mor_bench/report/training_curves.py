@@ -194,7 +194,7 @@ def still_falling(shown: Sequence[tuple[str, NDArray[np.float64]]]) -> str:
         return "Losses over the training"
     method = max(falls, key=lambda key: falls[key])
     if falls[method] < 0.05:
-        return "No loss falls by more than 5 % at the end: the trainings have levelled off"
+        return "No loss falls by more than 5 % in the last tenth of its training"
     return f"The loss of {shortened(method)} still falls by {100 * falls[method]:.0f} % at the end"
 
 

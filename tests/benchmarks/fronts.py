@@ -43,9 +43,11 @@ CORRECTED = "[cubature_tolerance=0.01,static_correction=true]"
 MORE = (
     f"quadratic-manifold-pod{CORRECTED}",
     f"pod-ann{CORRECTED}",
+    "local-pod[n_clusters=1]",
     "modal-derivatives",
     "sparse-polynomial-derivative",
     "pgd-snapshots",
+    "pca-gaussian-process",
 )
 
 TEST_SETS = re.compile(r"^\[tests\]\n(?:[^\[\n].*\n|\n)*", re.MULTILINE)

@@ -68,9 +68,9 @@ METHODS: dict[str, dict[str, Any]] = {
 Those without iterations are fitted to the numbers of samples alone, once for each.
 """
 
-BY_DEFAULT = ["pod-nn", "autoencoder", "pod-deeponet", "deeponet"]
+BY_DEFAULT = ["pod-nn", "autoencoder"]
 
-SHARES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+SHARES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Numbers of iterations, relative to those of the method's file."""
 SAMPLES = (64, 256, 1024)
 """Numbers of training samples, beside all; trained for the iterations of the method's file."""

@@ -14,6 +14,12 @@ TARGETS = (0.1, 0.03, 0.01, 0.003)
 LIMITS_MS = (0.3, 1.0, 3.0)
 """Times to stay within."""
 
+HEADINGS = [
+    "scene",
+    *(f"ms for {100 * error:g} %" for error in TARGETS),
+    *(f"% in {ms:g} ms" for ms in LIMITS_MS),
+]
+
 Rows = list[dict[str, Any]]
 
 
@@ -31,8 +37,20 @@ def fronts(source: str) -> str:
             _change(_best(before, ms), _best(now, ms), "rel_l2_p95", 100.0) for ms in LIMITS_MS
         ]
         body.append([dataset, *cells])
-    headings = ["scene", *(f"ms for {100 * error:g} %" for error in TARGETS)]
-    return markdown([*headings, *(f"% in {ms:g} ms" for ms in LIMITS_MS)], body)
+    return markdown(HEADINGS, body)
+
+
+def fronts_of_all(source: str) -> str:
+    """Show the fastest time for each error and the least error in each time, of today's methods."""
+    content = content_of(source)
+    rows = content["now"] + content["more"]
+    body = []
+    for dataset in dict.fromkeys(row["dataset"] for row in rows):
+        mine = [row for row in rows if row["dataset"] == dataset]
+        cells = [_value(_fastest(mine, error), "ms", 1.0) for error in TARGETS]
+        cells += [_value(_best(mine, ms), "rel_l2_p95", 100.0) for ms in LIMITS_MS]
+        body.append([dataset, *cells])
+    return markdown(HEADINGS, body)
 
 
 def _fastest(rows: Rows, error: float) -> dict[str, Any] | None:
@@ -49,8 +67,12 @@ def _change(
     before: dict[str, Any] | None, now: dict[str, Any] | None, name: str, scale: float
 ) -> str:
     """Return both values, and the method of today's."""
-    values = [DASH if row is None else number(scale * row[name]) for row in (before, now)]
-    return " → ".join(values) + ("" if now is None else f" `{now['method']}`")
+    return _value(before, name, scale).partition(" ")[0] + " → " + _value(now, name, scale)
+
+
+def _value(row: dict[str, Any] | None, name: str, scale: float) -> str:
+    """Return the value and its method."""
+    return DASH if row is None else f"{number(scale * row[name])} `{row['method']}`"
 
 
 FIGURES = {

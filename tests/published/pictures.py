@@ -30,6 +30,7 @@ from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
 from tests.published.compact import ERRORS, StoredRun
 from tests.published.stored import ROOT, EvidenceError, run_of
+from tests.published.training_curve_picture import training_curves
 
 OPENING = r"(?:!\[[^\]]*\]\(|<img src=\")"
 """A picture in Markdown, or in HTML, which can also state a width."""
@@ -48,17 +49,18 @@ DRAWINGS: dict[str, Callable[[Comparison, str, Analysis], Picture | None]] = {
 }
 """The pictures of a run that a page may show."""
 
+OF_FILES: dict[str, Callable[[str], Picture]] = {"training-curves": training_curves}
+"""The pictures of files, FILE,FILE,…."""
+
 
 def drawn(source: str, kind: str, dataset: str) -> bytes:
     """Draw a figure from a stored run; return the PNG with its digests."""
-    if kind not in DRAWINGS:
+    if kind in OF_FILES:
+        picture = OF_FILES[kind](source)
+    elif kind in DRAWINGS:
+        picture = _of_run(source, kind, dataset)
+    else:
         raise EvidenceError(f"{source}: there is no picture {kind!r}.")
-    analysis = run_of(source).analysis or {}
-    run = StoredRun.read(ROOT / source)
-    picture = DRAWINGS[kind](run, dataset, analysis)
-    if picture is None:
-        raise EvidenceError(f"{source}: no configuration of {dataset} can be drawn.")
-    explain_names(picture, run, dataset)
     digests: dict[str, str | None] = {
         "Software": f"matplotlib {matplotlib.__version__}",
         "Source": f"{source} {kind} {dataset} {source_digest(source)}",
@@ -67,10 +69,23 @@ def drawn(source: str, kind: str, dataset: str) -> bytes:
     return as_png(picture.figure, digests)
 
 
+def _of_run(source: str, kind: str, dataset: str) -> Picture:
+    analysis = run_of(source).analysis or {}
+    run = StoredRun.read(ROOT / source)
+    picture = DRAWINGS[kind](run, dataset, analysis)
+    if picture is None:
+        raise EvidenceError(f"{source}: no configuration of {dataset} can be drawn.")
+    explain_names(picture, run, dataset)
+    return picture
+
+
 def source_digest(source: str) -> str:
-    """Digest of the files that a picture of a run is drawn from."""
+    """Digest of the files, or of those of a run, that a picture is drawn from."""
     names = ("results.json", "comparison.json", ERRORS)
-    files = [(ROOT / source / name).read_bytes() for name in names]
+    paths = [ROOT / name for name in source.split(",")]
+    if paths[0].is_dir():
+        paths = [paths[0] / name for name in names]
+    files = [path.read_bytes() for path in paths]
     return hashlib.sha256(b"\0".join(files)).hexdigest()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from math import log2
 from statistics import median
 from typing import Any
 
@@ -37,13 +36,26 @@ def _grouped(points: Points, key: str) -> dict[int, Points]:
     return {n: [p for p in points if p[key] == n] for n in sorted({p[key] for p in points})}
 
 
-def _error(points: Points, part: str = "test") -> float:
+def curves_of(source: str) -> dict[str, dict[int, Points]]:
+    """Return the trainings with all samples of each method, by their iterations.
+
+    SOURCE is FILE,FILE,….
+    """
+    found = {}
+    for name, points in _by_method(source).items():
+        whole = max(point["n_train"] for point in points)
+        found[name] = _grouped([p for p in points if p["n_train"] == whole], "iterations")
+    return found
+
+
+def error_of(points: Points, part: str = "test") -> float:
+    """Return the median of e over trainings, in m, of the test or validation samples."""
     return float(median(point[part]["mean_dof_m"] for point in points))
 
 
 def _cell(points: Points) -> str:
     """Return the median, and the range in the median's power of ten."""
-    middle = f"{_error(points):.1e}".replace("e-0", "e-")
+    middle = f"{error_of(points):.1e}".replace("e-0", "e-")
     if len(points) == 1:
         return middle
     errors = sorted(point["test"]["mean_dof_m"] for point in points)
@@ -66,30 +78,22 @@ def flatness(errors: Sequence[float]) -> list[str]:
 
 
 def training_iterations(source: str) -> str:
-    """Show e of test samples over the iterations, with all training samples.
+    """Show e of test samples with the fewest and the most iterations, with all training samples.
 
     SOURCE is FILE,FILE,…. The method with the least e of its longest training comes first.
     """
-    body, most = [], 0
-    for name, points in _by_method(source).items():
-        whole = max(point["n_train"] for point in points)
-        curve = _grouped([point for point in points if point["n_train"] == whole], "iterations")
-        first, sets = min(curve), list(curve.values())
-        cells = {round(log2(n / first)): _cell(part) for n, part in curve.items()}
-        most = max(most, *cells)
-        relative = median(point["test"]["rel_l2_median"] for point in sets[-1])
+    body = []
+    for name, curve in curves_of(source).items():
+        sets = list(curve.values())
+        relative = float(median(point["test"]["rel_l2_median"] for point in sets[-1]))
         seconds = float(median(point["core_s"] for point in sets[-1]))
-        last = [number(100 * float(relative)), number(seconds)]
-        verdict = flatness([_error(part, "validation") for part in sets])
-        body.append((_error(sets[-1]), [f"`{name}`", f"{first:,}"], cells, last + verdict))
-    headings = ["method", "first number of iterations", "e with it, m"]
-    headings += [f"with {2**i} times as many" for i in range(1, most + 1)]
-    headings += ["median % of the last", "core-s of the last", *FLATNESS]
-    rows = [
-        start + [cells.get(i, "–") for i in range(most + 1)] + end
-        for _, start, cells, end in sorted(body, key=lambda row: row[0])
-    ]
-    return markdown(headings, rows)
+        cells = [f"`{name}`", f"{min(curve):,}", _cell(sets[0]), f"{max(curve):,}", _cell(sets[-1])]
+        cells += [number(100 * relative), number(seconds)]
+        verdict = flatness([error_of(part, "validation") for part in sets])
+        body.append((error_of(sets[-1]), cells + verdict))
+    headings = ["method", "fewest iterations", "e with them, m", "most iterations"]
+    headings += ["e with them, m", "median %", "core-s", *FLATNESS]
+    return markdown(headings, [cells for _, cells in sorted(body, key=lambda row: row[0])])
 
 
 def training_samples(source: str) -> str:
@@ -105,7 +109,7 @@ def training_samples(source: str) -> str:
         sizes = list(curve)
         seconds = float(median(point["core_s"] for point in curve[sizes[-1]]))
         cells = [f"`{name}`", f"{usual:,}" if usual else "–", *map(_cell, curve.values())]
-        body.append((_error(curve[sizes[-1]]), [*cells, number(seconds)]))
+        body.append((error_of(curve[sizes[-1]]), [*cells, number(seconds)]))
     headings = ["method", "iterations", *(f"e with {n:,} samples, m" for n in sizes)]
     rows = [cells for _, cells in sorted(body, key=lambda row: row[0])]
     return markdown([*headings, f"core-s with {sizes[-1]:,}"], rows)

@@ -1,0 +1,56 @@
+"""The picture of errors of networks over the time of their training."""
+
+from __future__ import annotations
+
+from statistics import median
+
+import numpy as np
+
+from mor_bench.report.canvas import LABEL, Picture, dress, log_ticks, new_figure
+from mor_bench.report.labels import Note, annotate
+from mor_bench.report.method_styles import readable, style_of
+from mor_bench.report.number_format import number
+from tests.published.training_curve_tables import curves_of, error_of, flatness
+
+CAPTION = (
+    "Mean error of test samples over the core-seconds of a training, a line per network. "
+    "Each point is a training of its own, the median of three seeds."
+)
+
+
+def training_curves(source: str) -> Picture:
+    """Draw e of test samples over core-seconds; the last point is filled if the curve is flat.
+
+    SOURCE is FILE,FILE,….
+    """
+    lines, notes, flat = [], [], []
+    for name, curve in curves_of(source).items():
+        points = [
+            (float(median(p["core_s"] for p in part)), error_of(part)) for part in curve.values()
+        ]
+        lines.append((name, np.array(points)))
+        if flatness([error_of(part, "validation") for part in curve.values()])[-1] == "yes":
+            flat.append(name)
+    best, course = min(lines, key=lambda line: float(line[1][-1, 1]))
+    finding = f"{best} errs least, {number(course[-1, 1])} m after {number(course[-1, 0])} core-s"
+    subject = f"beam-coarse: error over the training; {len(flat)} of {len(lines)} curves are flat, "
+    subject += "with a filled last point"
+    figure = new_figure(5.6, finding, subject)
+    axes = figure.subplots()
+    dress(axes)
+    for name, course in lines:
+        style = style_of(name)
+        axes.loglog(*course.T, color=style.colour, linestyle=style.line, linewidth=1.4)
+        face = style.colour if name in flat else "white"
+        look = {"color": style.colour, "markersize": 7, "markerfacecolor": face}
+        axes.loglog(*course[-1], style.marker, **look)
+        places = [(float(x), float(y)) for x, y in course[::-1]]
+        notes.append(Note(name, places, readable(style.colour), "bold", must=True))
+    log_ticks(axes.xaxis)
+    log_ticks(axes.yaxis)
+    axes.margins(x=0.14, y=0.06)
+    axes.set_xlabel("core-seconds of the training", fontsize=LABEL)
+    axes.set_ylabel("e of test samples (m)", fontsize=LABEL)
+    ends = [(float(course[-1, 0]), float(course[-1, 1])) for _, course in lines]
+    annotate(axes, notes, ends, [course for _, course in lines])
+    return Picture("training-curves", "Errors over the training", CAPTION, figure, finding)
