@@ -22,7 +22,7 @@ from tests.published.cost_tables import (
     probe_cost,
     scaling,
 )
-from tests.published.front_tables import fronts, nothing_slower
+from tests.published.front_tables import fronts, fronts_of_all, nothing_slower
 from tests.published.literature_table import literature
 from tests.published.network_size_tables import (
     full_sizes,
@@ -371,6 +371,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "network-sizes": network_sizes,
     "network-size-law": network_size_law,
     "fronts": fronts,
+    "fronts-of-all": fronts_of_all,
     "nothing-slower": nothing_slower,
     "stresses": stresses,
     "full-sizes": full_sizes,
