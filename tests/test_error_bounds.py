@@ -112,6 +112,27 @@ def test_spreads_of_zero_bound_only_errors_of_zero() -> None:
     assert calibrated(np.ones(20), None, 0.9).per_spread is None
 
 
+def test_loads_without_an_answer_have_infinite_errors_and_bounds() -> None:
+    errors, spreads = np.full(20, 0.1), np.full(20, 0.05)
+    errors[0], spreads[0] = np.nan, np.inf
+    with np.errstate(all="raise"):
+        bound = calibrated(errors, None, 0.9, spreads)
+        assert bound.relative_l2 == 0.1
+        assert bound.per_spread == pytest.approx(2.0)
+        scores = {
+            "test": {"relative_l2": np.array([np.inf, 0.3]), "spread": np.array([np.inf, 0.1])}
+        }
+        assert covered(bound, scores, scaled=True) == {"test": 0.5}
+        none = replace(bound, per_spread=0.0)
+        lost = np.full((2, 4, 3), np.nan)
+        for found in (
+            bound.of_prediction(lost),
+            none.of_prediction(np.ones((2, 4, 3)), [np.inf, np.inf]),
+        ):
+            np.testing.assert_array_equal(found, np.inf)
+    assert calibrated(np.full(20, np.nan), None).relative_l2 == np.inf
+
+
 def test_an_ensemble_gives_each_load_its_own_bound(tiny: Dataset) -> None:
     pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
     method: Any = mor_bench.load_method("pod-nn-ensemble", iterations=200, n_hidden=16)

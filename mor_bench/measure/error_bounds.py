@@ -3,7 +3,8 @@
 The samples for the calibration must not have been used for training. Loads of one region share
 their errors, so a region counts as one group: Lee, Barber and Willett, "Distribution-free inference
 with hierarchical data" (2023), section 3. The bound then holds for a load in a new region, if the
-regions are exchangeable. It says nothing about other kinds of loads.
+regions are exchangeable. It says nothing about other kinds of loads. Samples with several forces
+share regions in many ways, so each counts as a group, and the bound is no promise for new regions.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ class ErrorBound:
 
         A relative bound b < 1 gives the error at most b / (1 - b) times the norm of the prediction,
         since the norm of the reference is at most that of the prediction plus that of the error.
-        For b >= 1 the bound is infinite.
+        For b >= 1, and for a prediction that is not finite, the bound is infinite.
 
         Parameters
         ----------
@@ -112,16 +113,18 @@ class ErrorBound:
                 )
             share = np.full(given.shape, inf)
             if isfinite(self.per_spread):
-                share = self.per_spread * given
-        within = np.where(share < 1, share, 0.0)
-        return np.asarray(np.where(share < 1, within / (1 - within) * norm, inf))
+                share = _scaled(self.per_spread, given)
+        known = (share < 1) & np.isfinite(norm)
+        within, size = np.where(known, share, 0.0), np.where(known, norm, 0.0)
+        return np.asarray(np.where(known, within / (1 - within) * size, inf))
 
 
 def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> ErrorBound:
     """Calibrate a bound of a fitted method's error on samples that it has not learned from.
 
     Samples of one load region count as one group if the scene's split is by region, as in a run.
-    Otherwise each sample is a group of its own.
+    Otherwise, and with several forces at a time, each sample is a group of its own. Then the bound
+    is no promise for loads in new regions.
 
     Parameters
     ----------
@@ -179,6 +182,7 @@ def calibrated(
     Parameters
     ----------
     errors : (n,) float64
+        NaN counts as infinite.
     regions : (n,) or (n, k) int64, optional
         Load regions of the samples. Samples with several forces share regions in many ways, so each
         counts as a group of its own. So does each sample if `regions` is None.
@@ -186,6 +190,7 @@ def calibrated(
     spreads : (n,) float64, optional
         Those of an ensemble; they give the bound `per_spread`.
     """
+    errors = np.where(np.isnan(errors), inf, errors)
     groups = np.arange(len(errors))
     if regions is not None and regions.ndim == 1:
         groups = np.unique(regions, return_inverse=True)[1]
@@ -193,8 +198,9 @@ def calibrated(
     mass = 1.0 / np.bincount(groups)[groups] / (n_groups + 1)
     per_spread = None
     if spreads is not None:
-        scores = np.where(errors > 0, inf, 0.0)
-        np.divide(errors, spreads, out=scores, where=spreads > 0)
+        # An infinite spread bounds any error.
+        scores = np.where((errors > 0) & np.isfinite(spreads), inf, 0.0)
+        np.divide(errors, spreads, out=scores, where=(spreads > 0) & np.isfinite(spreads))
         per_spread = _quantile(scores, mass, level)
     bound = _quantile(errors, mass, level)
     return ErrorBound(level, bound, len(errors), n_groups, per_spread=per_spread)
@@ -218,6 +224,14 @@ def covered(
     if share is None or not isfinite(share):
         return {}
     return {
-        name: float((score["relative_l2"] <= share * (score["spread"] if scaled else 1.0)).mean())
+        name: float(
+            (score["relative_l2"] <= (_scaled(share, score["spread"]) if scaled else share)).mean()
+        )
         for name, score in scores.items()
     }
+
+
+def _scaled(per_spread: float, spreads: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return `per_spread` times each spread, and infinity for an infinite spread."""
+    finite = np.isfinite(spreads)
+    return np.where(finite, per_spread * np.where(finite, spreads, 0.0), inf)

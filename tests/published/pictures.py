@@ -29,6 +29,7 @@ from mor_bench.report.figures import explain_names
 from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
 from tests.published.compact import ERRORS, StoredRun
+from tests.published.front_picture import fronts_picture
 from tests.published.stored import ROOT, EvidenceError, run_of
 from tests.published.training_curve_picture import training_curves
 
@@ -49,7 +50,10 @@ DRAWINGS: dict[str, Callable[[Comparison, str, Analysis], Picture | None]] = {
 }
 """The pictures of a run that a page may show."""
 
-OF_FILES: dict[str, Callable[[str], Picture]] = {"training-curves": training_curves}
+OF_FILES: dict[str, Callable[[str], Picture]] = {
+    "training-curves": training_curves,
+    "fronts": fronts_picture,
+}
 """The pictures of files, FILE,FILE,…."""
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from statistics import median
-
 import numpy as np
 
-from mor_bench.report.canvas import LABEL, Picture, dress, log_ticks, new_figure
+from mor_bench.report.canvas import GREY, LABEL, NOTE, Picture, dress, log_ticks, new_figure
 from mor_bench.report.labels import Note, annotate
 from mor_bench.report.method_styles import readable, style_of
 from mor_bench.report.number_format import number
-from tests.published.training_curve_tables import curves_of, error_of, flatness
+from mor_bench.specs import load_method_spec
+from tests.benchmarks.learning_curves import METHODS
+from tests.published.stored import content_of
+from tests.published.training_curve_tables import core_seconds, curves_of, error_of, flatness
+
+BASELINE = "reports/learned/region/results.json"
+"""A run with the linear response alone on the same test samples."""
 
 CAPTION = (
     "Mean error of test samples over the core-seconds of a training, a line per network. "
@@ -25,17 +29,14 @@ def training_curves(source: str) -> Picture:
     """
     lines, notes, flat = [], [], []
     for name, curve in curves_of(source).items():
-        points = [
-            (float(median(p["core_s"] for p in part)), error_of(part)) for part in curve.values()
-        ]
+        points = [(core_seconds(part), error_of(part)) for part in curve.values()]
         lines.append((name, np.array(points)))
         if flatness([error_of(part, "validation") for part in curve.values()])[-1] == "yes":
             flat.append(name)
     best, course = min(lines, key=lambda line: float(line[1][-1, 1]))
     finding = f"{best} errs least, {number(course[-1, 1])} m after {number(course[-1, 0])} core-s"
-    subject = f"beam-coarse: error over the training; {len(flat)} of {len(lines)} curves are flat, "
-    subject += "with a filled last point"
-    figure = new_figure(5.6, finding, subject)
+    subject = "beam-coarse: error over the training. Filled last point: the curve is flat "
+    figure = new_figure(6.2, finding, f"{subject}({len(flat)} of {len(lines)}). Open: it is not")
     axes = figure.subplots()
     dress(axes)
     for name, course in lines:
@@ -44,8 +45,23 @@ def training_curves(source: str) -> Picture:
         face = style.colour if name in flat else "white"
         look = {"color": style.colour, "markersize": 7, "markerfacecolor": face}
         axes.loglog(*course[-1], style.marker, **look)
-        places = [(float(x), float(y)) for x, y in course[::-1]]
-        notes.append(Note(name, places, readable(style.colour), "bold", must=True))
+        spec = load_method_spec(name)
+        told = spec.told_with(spec.parameters | METHODS[name])
+        text = f"{name}, force only" if told == "force" else name
+        places = [(float(x), float(y)) for x, y in course[:-4:-1]]
+        notes.append(Note(text, places, readable(style.colour), "bold", must=True))
+    (linear,) = (row for row in content_of(BASELINE)["rows"] if row["label"] == "linear-fem")
+    level = float(linear["error"]["mean_dof_m"])
+    axes.axhline(level, color=GREY, linestyle="--", linewidth=1.0)
+    axes.text(
+        0.01,
+        level,
+        "linear-fem",
+        color=GREY,
+        fontsize=NOTE,
+        va="bottom",
+        transform=axes.get_yaxis_transform(),
+    )
     log_ticks(axes.xaxis)
     log_ticks(axes.yaxis)
     axes.margins(x=0.14, y=0.06)

@@ -77,22 +77,28 @@ def flatness(errors: Sequence[float]) -> list[str]:
     return [", ".join(f"{100 * fall:.1f}" for fall in falls), verdict]
 
 
-def training_iterations(source: str) -> str:
-    """Show e of test samples with the fewest and the most iterations, with all training samples.
+def core_seconds(points: Points) -> float:
+    """Return the least core-seconds of trainings that differ by their seeds."""
+    return float(min(point["core_s"] for point in points))
 
-    SOURCE is FILE,FILE,…. The method with the least e of its longest training comes first.
+
+def training_iterations(source: str) -> str:
+    """Show e of test samples over the iterations, with all training samples, for each method.
+
+    Shown are the fewest iterations, those with the least error on validation samples, and the most
+    ones. SOURCE is FILE,FILE,…. The method with the least selected e comes first.
     """
     body = []
     for name, curve in curves_of(source).items():
-        sets = list(curve.values())
-        relative = float(median(point["test"]["rel_l2_median"] for point in sets[-1]))
-        seconds = float(median(point["core_s"] for point in sets[-1]))
-        cells = [f"`{name}`", f"{min(curve):,}", _cell(sets[0]), f"{max(curve):,}", _cell(sets[-1])]
-        cells += [number(100 * relative), number(seconds)]
-        verdict = flatness([error_of(part, "validation") for part in sets])
-        body.append((error_of(sets[-1]), cells + verdict))
-    headings = ["method", "fewest iterations", "e with them, m", "most iterations"]
-    headings += ["e with them, m", "median %", "core-s", *FLATNESS]
+        held_out = {n: error_of(part, "validation") for n, part in curve.items()}
+        selected = min(held_out, key=lambda n: held_out[n])
+        first, best = curve[min(curve)], curve[selected]
+        relative = float(median(point["test"]["rel_l2_median"] for point in best))
+        cells = [f"`{name}`", f"{min(curve):,}", _cell(first), f"{selected:,}", _cell(best)]
+        cells += [number(100 * relative), number(core_seconds(best)), f"{max(curve):,}"]
+        body.append((error_of(best), cells + flatness(list(held_out.values()))))
+    headings = ["method", "fewest iterations", "e with them, m", "selected iterations"]
+    headings += ["e with them, m", "median %", "core-s", "most iterations", *FLATNESS]
     return markdown(headings, [cells for _, cells in sorted(body, key=lambda row: row[0])])
 
 
@@ -107,9 +113,9 @@ def training_samples(source: str) -> str:
         (usual,) = {point["iterations"] for point in points if point["n_train"] == fewest}
         curve = _grouped([point for point in points if point["iterations"] == usual], "n_train")
         sizes = list(curve)
-        seconds = float(median(point["core_s"] for point in curve[sizes[-1]]))
+        seconds = number(core_seconds(curve[sizes[-1]]))
         cells = [f"`{name}`", f"{usual:,}" if usual else "–", *map(_cell, curve.values())]
-        body.append((error_of(curve[sizes[-1]]), [*cells, number(seconds)]))
+        body.append((error_of(curve[sizes[-1]]), [*cells, seconds]))
     headings = ["method", "iterations", *(f"e with {n:,} samples, m" for n in sizes)]
     rows = [cells for _, cells in sorted(body, key=lambda row: row[0])]
     return markdown([*headings, f"core-s with {sizes[-1]:,}"], rows)
