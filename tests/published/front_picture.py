@@ -48,8 +48,14 @@ def fronts_picture(source: str) -> Picture:
         Line2D([], [], color=style_of(m).colour, marker=style_of(m).marker, linestyle="", label=m)
         for m in methods
     ]
-    look = {"ncols": 3, "fontsize": NOTE, "frameon": False, "columnspacing": 1.0}
-    figure.legend(handles=handles, loc="outside lower center", **look)
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=3,
+        fontsize=NOTE,
+        frameon=False,
+        columnspacing=1.0,
+    )
     return Picture("fronts", "Fronts before and now", CAPTION, figure, finding)
 
 
@@ -64,7 +70,8 @@ def _front(rows: list[dict[str, Any]], scene: str) -> NDArray[np.float64]:
     places = _places(rows, scene)
     places = places[np.lexsort((places[:, 1], places[:, 0]))]
     least = np.minimum.accumulate(places[:, 1])
-    return places[np.append(True, least[1:] < least[:-1])]
+    first = np.append(True, least[1:] < least[:-1])
+    return np.asarray(places[first])
 
 
 def _draw(axes: Axes, scene: str, rows: list[dict[str, Any]]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mor_bench.report.canvas import GREY, LABEL, NOTE, Picture, dress, log_ticks, new_figure
+from mor_bench.report.canvas import GREY, LABEL, Picture, dress, log_ticks, new_figure
 from mor_bench.report.labels import Note, annotate
 from mor_bench.report.method_styles import readable, style_of
 from mor_bench.report.number_format import number
@@ -47,24 +47,17 @@ def training_curves(source: str) -> Picture:
         axes.loglog(*course[-1], style.marker, **look)
         spec = load_method_spec(name)
         told = spec.told_with(spec.parameters | METHODS[name])
-        text = f"{name}, force only" if told == "force" else name
+        text = f"{name}, force only" if told == "input" else name
         places = [(float(x), float(y)) for x, y in course[:-4:-1]]
-        notes.append(Note(text, places, readable(style.colour), "bold", must=True))
+        notes.append(Note(text, places, readable(style.colour), "bold", must=True, leader=False))
     (linear,) = (row for row in content_of(BASELINE)["rows"] if row["label"] == "linear-fem")
     level = float(linear["error"]["mean_dof_m"])
     axes.axhline(level, color=GREY, linestyle="--", linewidth=1.0)
-    axes.text(
-        0.01,
-        level,
-        "linear-fem",
-        color=GREY,
-        fontsize=NOTE,
-        va="bottom",
-        transform=axes.get_yaxis_transform(),
-    )
+    start = min(float(course[0, 0]) for _, course in lines)
+    notes.append(Note("linear-fem", [(start, level)], GREY, must=True))
     log_ticks(axes.xaxis)
     log_ticks(axes.yaxis)
-    axes.margins(x=0.14, y=0.06)
+    axes.margins(x=0.2, y=0.06)
     axes.set_xlabel("core-seconds of the training", fontsize=LABEL)
     axes.set_ylabel("e of test samples (m)", fontsize=LABEL)
     ends = [(float(course[-1, 0]), float(course[-1, 1])) for _, course in lines]
