@@ -19,6 +19,7 @@ import numpy as np
 from matplotlib import image
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from mor_bench.report.canvas import Picture, as_png
 from mor_bench.report.entries import Analysis
@@ -65,12 +66,15 @@ def drawn(source: str, kind: str, dataset: str) -> bytes:
         picture = _of_run(source, kind, dataset)
     else:
         raise EvidenceError(f"{source}: there is no picture {kind!r}.")
-    digests: dict[str, str | None] = {
-        "Software": f"matplotlib {matplotlib.__version__}",
-        "Source": f"{source} {kind} {dataset} {source_digest(source)}",
-        "Comment": pixel_digest(as_png(picture.figure, {})),
-    }
-    return as_png(picture.figure, digests)
+    png = as_png(picture.figure, {})
+    texts = PngInfo()
+    texts.add_text("Software", f"matplotlib {matplotlib.__version__}")
+    texts.add_text("Source", f"{source} {kind} {dataset} {source_digest(source)}")
+    texts.add_text("Comment", pixel_digest(png))
+    content = io.BytesIO()
+    with Image.open(io.BytesIO(png)) as opened:
+        opened.save(content, "png", pnginfo=texts, dpi=opened.info["dpi"])
+    return content.getvalue()
 
 
 def _of_run(source: str, kind: str, dataset: str) -> Picture:

@@ -49,7 +49,7 @@ def training_curves(source: str) -> Picture:
         told = spec.told_with(spec.parameters | METHODS[name])
         text = f"{name}, force only" if told == "input" else name
         places = [(float(x), float(y)) for x, y in course[:-4:-1]]
-        notes.append(Note(text, places, readable(style.colour), "bold", must=True, leader=False))
+        notes.append(Note(text, places, readable(style.colour), "bold", must=True))
     (linear,) = (row for row in content_of(BASELINE)["rows"] if row["label"] == "linear-fem")
     level = float(linear["error"]["mean_dof_m"])
     axes.axhline(level, color=GREY, linestyle="--", linewidth=1.0)
