@@ -17,7 +17,8 @@ BASELINE = "reports/learned/region/results.json"
 
 CAPTION = (
     "Mean error of test samples over the core-seconds of a training, a line per network. "
-    "Each point is a training of its own, the median of three seeds."
+    "Each point is a training of its own: the median error of three seeds, and the time of the "
+    "fastest."
 )
 
 
