@@ -223,12 +223,11 @@ def covered(
     share = bound.per_spread if scaled else bound.relative_l2
     if share is None or not isfinite(share):
         return {}
-    return {
-        name: float(
-            (score["relative_l2"] <= (_scaled(share, score["spread"]) if scaled else share)).mean()
-        )
+    held = {
+        name: score["relative_l2"] <= (_scaled(share, score["spread"]) if scaled else share)
         for name, score in scores.items()
     }
+    return {name: float(each.mean()) for name, each in held.items()}
 
 
 def _scaled(per_spread: float, spreads: NDArray[np.float64]) -> NDArray[np.float64]:

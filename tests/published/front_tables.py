@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from mor_bench.analysis.frontier import Point, fastest_within, most_accurate_within
 from mor_bench.report.number_format import DASH, number
 from tests.published.run_tables import markdown
 from tests.published.stored import content_of
@@ -20,23 +22,26 @@ HEADINGS = [
     *(f"% in {ms:g} ms" for ms in LIMITS_MS),
 ]
 
-Rows = list[dict[str, Any]]
+
+def points_on(scene: str, rows: Sequence[Mapping[str, Any]]) -> list[Point]:
+    """Return latency and 95th percentile of the error on a scene, with the method as label."""
+    mine = (row for row in rows if row["dataset"] == scene)
+    return [Point(row["ms"], row["rel_l2_p95"], row["method"]) for row in mine]
+
+
+def scenes_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the scenes of rows, in their order."""
+    return list(dict.fromkeys(row["dataset"] for row in rows))
 
 
 def fronts(source: str) -> str:
     """Show the fastest time for each error and the least error in each time, before and now."""
     content = content_of(source)
     body = []
-    for dataset in dict.fromkeys(row["dataset"] for row in content["now"]):
-        before, now = (
-            [row for row in content[code] if row["dataset"] == dataset]
-            for code in ("before", "now")
-        )
-        cells = [_change(_fastest(before, e), _fastest(now, e), "ms", 1.0) for e in TARGETS]
-        cells += [
-            _change(_best(before, ms), _best(now, ms), "rel_l2_p95", 100.0) for ms in LIMITS_MS
-        ]
-        body.append([dataset, *cells])
+    for scene in scenes_of(content["now"]):
+        before, now = (_figures(points_on(scene, content[code])) for code in ("before", "now"))
+        cells = (f"{old} → {_with_method(new)}" for (old, _), new in zip(before, now, strict=True))
+        body.append([scene, *cells])
     return markdown(HEADINGS, body)
 
 
@@ -44,35 +49,25 @@ def fronts_of_all(source: str) -> str:
     """Show the fastest time for each error and the least error in each time, of today's methods."""
     content = content_of(source)
     rows = content["now"] + content["more"]
-    body = []
-    for dataset in dict.fromkeys(row["dataset"] for row in rows):
-        mine = [row for row in rows if row["dataset"] == dataset]
-        cells = [_value(_fastest(mine, error), "ms", 1.0) for error in TARGETS]
-        cells += [_value(_best(mine, ms), "rel_l2_p95", 100.0) for ms in LIMITS_MS]
-        body.append([dataset, *cells])
+    body = [
+        [scene, *map(_with_method, _figures(points_on(scene, rows)))] for scene in scenes_of(rows)
+    ]
     return markdown(HEADINGS, body)
 
 
-def _fastest(rows: Rows, error: float) -> dict[str, Any] | None:
-    able = [row for row in rows if row["rel_l2_p95"] <= error]
-    return min(able, key=lambda row: float(row["ms"]), default=None)
+def _figures(points: Sequence[Point]) -> list[tuple[str, str]]:
+    """Return the figure of each heading but the first, and its method."""
+    fastest = [fastest_within(points, error) for error in TARGETS]
+    best = [most_accurate_within(points, ms) for ms in LIMITS_MS]
+    return [
+        *((DASH, "") if p is None else (number(p.latency_ms), p.label) for p in fastest),
+        *((DASH, "") if p is None else (number(100.0 * p.error), p.label) for p in best),
+    ]
 
 
-def _best(rows: Rows, ms: float) -> dict[str, Any] | None:
-    able = [row for row in rows if row["ms"] <= ms]
-    return min(able, key=lambda row: float(row["rel_l2_p95"]), default=None)
-
-
-def _change(
-    before: dict[str, Any] | None, now: dict[str, Any] | None, name: str, scale: float
-) -> str:
-    """Return both values, and the method of today's."""
-    return _value(before, name, scale).partition(" ")[0] + " → " + _value(now, name, scale)
-
-
-def _value(row: dict[str, Any] | None, name: str, scale: float) -> str:
-    """Return the value and its method."""
-    return DASH if row is None else f"{number(scale * row[name])} `{row['method']}`"
+def _with_method(figure: tuple[str, str]) -> str:
+    value, method = figure
+    return f"{value} `{method}`" if method else value
 
 
 FIGURES = {
