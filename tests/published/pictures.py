@@ -31,6 +31,7 @@ from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
 from tests.published.compact import ERRORS, StoredRun
 from tests.published.front_picture import fronts_picture
+from tests.published.sampling_picture import sampling_cost
 from tests.published.stored import ROOT, EvidenceError, run_of
 from tests.published.training_curve_picture import training_curves
 
@@ -54,6 +55,7 @@ DRAWINGS: dict[str, Callable[[Comparison, str, Analysis], Picture | None]] = {
 OF_FILES: dict[str, Callable[[str], Picture]] = {
     "training-curves": training_curves,
     "fronts": fronts_picture,
+    "sampling-cost": sampling_cost,
 }
 """The pictures of files, FILE,FILE,…."""
 

@@ -23,11 +23,11 @@ def learning_curves(source: str, dataset: str, method: str) -> str:
     rows = content_of(source)[dataset]["methods"][method]
     found = {(row["way"], row["n"]): row for row in rows}
     sizes = sorted({row["n"] for row in rows})
-    base_s = _core_s(found["random", COMPARED])
+    base_s = core_seconds(found["random", COMPARED])
     body = []
     for way in dict.fromkeys(row["way"] for row in rows):
         cells = [_errors(found.get((way, n))) for n in sizes]
-        core_s = _core_s(found[way, COMPARED])
+        core_s = core_seconds(found[way, COMPARED])
         cost = [number(1e3 * core_s / COMPARED), number(core_s / base_s)]
         body.append([way, *cells, *cost])
     headings = ["median %; p95 %", *(f"n = {n}" for n in sizes)]
@@ -38,15 +38,16 @@ def learning_curves(source: str, dataset: str, method: str) -> str:
 def _errors(row: Mapping[str, Any] | None) -> str:
     if row is None:
         return DASH
-    return "; ".join(_percent(row[name]) for name in ("median", "p95"))
+    errors = [middle(row[name]) for name in ("median", "p95")]
+    return "; ".join(number(100 * e) if np.isfinite(e) else "∞" for e in errors)
 
 
-def _percent(values: Sequence[float | None]) -> str:
-    middle = float(np.median([np.inf if value is None else value for value in values]))
-    return number(100 * middle) if np.isfinite(middle) else "∞"
+def middle(values: Sequence[float | None]) -> float:
+    """Return the median of errors, where None is an infinite one."""
+    return float(np.median([np.inf if value is None else value for value in values]))
 
 
-def _core_s(row: Mapping[str, Any]) -> float:
+def core_seconds(row: Mapping[str, Any]) -> float:
     """Return the core-seconds of all snapshots: solves, fits and choices."""
     parts = np.sum([row[name] for name in ("solve", "fit", "choose")], axis=0)
     return float(np.median(parts))
