@@ -286,7 +286,12 @@ def test_modes_of_a_damaged_model_are_refused(spoil: str, tiny: Dataset) -> None
 
 
 @pytest.mark.parametrize(
-    ("name", "knobs"), [*NO_SNAPSHOTS, ("local-pod", {"n_clusters": 2, "n_modes": 4})]
+    ("name", "knobs"),
+    [
+        *NO_SNAPSHOTS,
+        ("local-pod", {"n_clusters": 2, "n_modes": 4}),
+        ("hpod", {"n_modes": 4, "static_correction": True}),
+    ],
 )
 def test_a_body_that_the_static_correction_inverts_is_refused(
     name: str, knobs: dict[str, Any], tiny: Dataset

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.counting import count, is_counting
+from mor_bench.mechanics import inversion
 from mor_bench.mechanics.discretisation import (
     Discretisation,
     distinct,
@@ -279,8 +280,7 @@ class Assembler:
         self, u: Array, dofs: NDArray[np.uint32], batches: Batches, force: Array, values: Array
     ) -> tuple[float, float]:
         """Add forces and tangents of batches of cells; return energy and min det F."""
-        gradients, second, third, slots = batches
-        cells = gradients, second, third
+        *cells, slots = batches
         out: tuple[float, float]
         if not self._has_own_kernel:
             tangent = (slots, force, values) if len(values) else (None, force, None)
@@ -329,6 +329,13 @@ class Assembler:
             return State(force[: self.n_dofs], *found)
         found = self._sum_all(self._total(u), force, np.zeros(0))
         return self._from_rest(u, self._at_unknowns(force), *found)
+
+    def least_det_f(self, u: Array) -> float:
+        """Return the smallest det F at displacements ``u`` (n_dofs,), m."""
+        if self._dofs.shape[1] != H8.n_nodes:
+            return self.force(u).min_det_f
+        count(multiply_adds=self.n_cells * self._gradients.shape[1] * inversion.MULTIPLY_ADDS)
+        return float(inversion.least_det_f(self._total(u), self._dofs, self._gradients))
 
     def _at_unknowns(self, force: Array) -> Array:
         """Return the forces at the unknowns, of forces in a vector of the kernels."""

@@ -16,8 +16,24 @@ from mor_bench.errors import InvertedElementError
 from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
-from mor_bench.reduction.galerkin import GalerkinProblem
+from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem
 from mor_bench.reduction.tensors import TensorProblem
+
+LINEAR_WEIGHT = 0.2
+"""Weight of the linear responses among the snapshots. The static correction supplies them, but the
+basis must be able to rotate and bend them."""
+
+
+def corrected_snapshots(
+    displacements: NDArray[np.float64], linear: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the snapshots (2 n, n_free), m, that span a basis with static correction.
+
+    For each displacement and linear response, both (n, n_free), these are the nonlinear part
+    u - K₀⁻¹f and, with a small weight, the linear response.
+    """
+    both = np.hstack([displacements - linear, LINEAR_WEIGHT * linear])
+    return both.reshape(-1, displacements.shape[1])
 
 
 def static_correction(
@@ -53,7 +69,7 @@ def static_correction(
 
 
 def predict_corrected(
-    problem: GalerkinProblem | TensorProblem,
+    problem: GalerkinProblem | CubatureProblem | TensorProblem,
     modes: NDArray[np.float64],
     model: FullOrderModel,
     rest_factor: Factor,
@@ -70,6 +86,8 @@ def predict_corrected(
     reduced = modes.T @ load
     if isinstance(problem, TensorProblem):
         q = problem.solve(reduced, tolerance)
+    elif isinstance(problem, CubatureProblem):
+        q = problem.solve(reduced, NewtonOptions(tolerance)).displacement
     else:
         q = solve_equilibrium(problem, reduced, options=NewtonOptions(tolerance)).displacement
     u = rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))
@@ -79,7 +97,7 @@ def predict_corrected(
 
 def refuse_inverted(model: FullOrderModel, u: NDArray[np.float64]) -> None:
     """Raise `InvertedElementError` if displacements u (n_free,), m, invert cells."""
-    least = model.force(u).min_det_f
+    least = model.assembler.least_det_f(u)
     if not least > 0:
         raise InvertedElementError(
             f"the reduced answer inverts elements: its least det F is {least:.3g}."

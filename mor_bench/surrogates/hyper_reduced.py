@@ -104,6 +104,10 @@ class CubatureSurrogate(Surrogate):
     def supports(self, scene: Scene) -> str | None:
         return unknown_equations(scene, contact=True)
 
+    def choose_modes(self, scene: Scene, samples: Snapshots) -> Array:
+        """Return the modes (n_free, r)."""
+        return accurate_modes(samples.free_displacements, self.value("n_modes"))
+
     @abstractmethod
     def choose_cells(
         self, states: States, modes: Array, tolerance: float
@@ -115,8 +119,8 @@ class CubatureSurrogate(Surrogate):
         """
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
-        displacements, tolerance = samples.free_displacements, self.value("cubature_tolerance")
-        modes = accurate_modes(displacements, self.value("n_modes"))
+        tolerance = self.value("cubature_tolerance")
+        modes = self.choose_modes(scene, samples)
         if tolerance == 0:
             whole = {"cells": np.arange(scene.mesh.n_cells), "weights": np.ones(scene.mesh.n_cells)}
             return {"modes": modes, **whole}

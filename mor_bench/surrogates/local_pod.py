@@ -17,7 +17,7 @@ from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
-from mor_bench.reduction.static_correction import predict_corrected
+from mor_bench.reduction.static_correction import corrected_snapshots, predict_corrected
 from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -34,10 +34,6 @@ OVERLAP = 0.5
 
 N_WATCHED = 300
 """Samples of a cluster that decide where det F is monitored."""
-
-LINEAR_WEIGHT = 0.2
-"""Weight of the linear responses among the snapshots. The static correction supplies them, but the
-basis must be able to rotate and bend them."""
 
 
 @dataclass(eq=False)
@@ -108,8 +104,7 @@ class LocalPOD(Surrogate):
     ) -> list[Array]:
         """Return a basis (n_free, r) per cluster, from its samples and near ones of others."""
         distances = np.linalg.norm(directions[:, None] - centroids, axis=2)
-        both = np.hstack([displacements - linear, LINEAR_WEIGHT * linear])
-        both = both.reshape(len(linear), 2, -1)
+        both = corrected_snapshots(displacements, linear).reshape(len(linear), 2, -1)
         bases = []
         for cluster in range(len(centroids)):
             own, others = np.flatnonzero(labels == cluster), np.flatnonzero(labels != cluster)

@@ -66,12 +66,19 @@ def hyper(size: int) -> list[Contender]:
     """Return plain POD and its hyper-reduced forms with as many modes.
 
     The tolerances of the cubatures are those of the quick sweeps. Interpolation has two force modes
-    for each displacement mode.
+    for each displacement mode. `local-pod` with one cluster is POD with static correction.
     """
-    forms: dict[str, tuple[str, Parameters]] = {"pod": ("pod", {})}
+    forms: dict[str, tuple[str, Parameters]] = {
+        "pod": ("pod", {}),
+        "pod, corrected": ("local-pod", {"n_clusters": 1}),
+    }
     for matching in ("force", "energy"):
         cubatures: dict[str, tuple[str, Parameters]] = {
             "hpod, points": ("hpod", {"sampling": "points", "cubature_tolerance": 5e-3}),
+            "hpod, points, corrected": (
+                "hpod",
+                {"sampling": "points", "cubature_tolerance": 5e-3, "static_correction": True},
+            ),
             "hpod, moved": ("hpod", {"sampling": "moved", "cubature_tolerance": 5e-3}),
             "hpod, cells": ("hpod", {"sampling": "cells", "cubature_tolerance": 5e-3}),
             "ecm": ("ecm", {"cubature_tolerance": 1e-2}),
@@ -116,14 +123,15 @@ def reconstruction(method: mor_bench.Surrogate, samples: Snapshots) -> Array | N
 
     The nearest displacement counts, by least squares over the coordinates. For a manifold with
     static correction, the correction under the sample's load is part of it. None for methods that
-    have neither modes nor a manifold.
+    have neither modes nor a manifold, and for modes with static correction.
     """
     u = samples.free_displacements
     if isinstance(method, CurvedPOD):
         rests = [_distance(method, own) for own in u - method.offsets(samples.free_forces)]
         return np.asarray(np.array(rests) / np.linalg.norm(u, axis=1))
     modes = getattr(method, "modes_", None)
-    if not isinstance(modes, np.ndarray) or modes.ndim != 2:
+    corrected = getattr(method, "static_correction", False)
+    if corrected or not isinstance(modes, np.ndarray) or modes.ndim != 2:
         return None
     return np.asarray(np.linalg.norm(u - u @ modes @ modes.T, axis=1) / np.linalg.norm(u, axis=1))
 
