@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import mor_bench
 from mor_bench.counting import Cost, counted
 from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.hard_cases.setups import LAW
@@ -25,17 +24,14 @@ from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.other_meshes import with_cells
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
-from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.surrogates.cubature_states import are_far, equilibria, in_energy, projected_states
 from mor_bench.surrogates.deim import InterpolatedPOD
 from mor_bench.surrogates.ecm import EmpiricalCubaturePOD
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.hyper_reduced import nodal, reduced_points
-from mor_bench.surrogates.linear_fem import LinearFEM
-from mor_bench.surrogates.local_pod import LocalPOD
 from mor_bench.surrogates.pod import PODGalerkin
 from tests.verification.laws_and_elements import EVERY
-from tests.verification.scenes import scene_of
+from tests.verification.scenes import scene_of, solved
 
 Array = NDArray[np.float64]
 
@@ -99,18 +95,6 @@ def test_the_check_for_inverted_cells_finds_the_det_f_of_the_force(
     assert least < 0
 
 
-def solved(scene: Scene, n: int) -> Snapshots:
-    """Return samples of a scene that no dataset holds."""
-    loads = draw_loads(scene, 0, n)
-    found = FullOrderModel(scene).solve_many(
-        loads.nodal_forces(scene.patch_weights).reshape(n, -1)[:, scene.free_dofs]
-    )
-    answers = [answer for answer in found if not isinstance(answer, SolverError)]
-    assert len(answers) == n
-    displacements = np.array([answer.displacement for answer in answers])
-    return Snapshots(scene, loads, displacements, np.array([a.min_det_f for a in answers]))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_hyper_reduction_works_for_every_law_and_element(law: str, kind: tuple[str, bool]) -> None:
@@ -136,32 +120,6 @@ def test_hyper_reduction_works_for_every_law_and_element(law: str, kind: tuple[s
     for method in (few, fewer, greedy, sampled):
         assert len(method.cells_) < scene.mesh.n_cells
         assert np.abs(method.predict(train.forces) - plain).max() <= 0.03 * size
-
-
-@pytest.mark.parametrize(
-    ("law", "kind"), [("neo-hookean", ("hexahedron", True)), ("yeoh", ("tetrahedron", False))]
-)
-def test_static_correction_over_all_cells_is_that_of_a_single_local_basis(
-    law: str, kind: tuple[str, bool]
-) -> None:
-    scene = scene_of(law, kind)
-    train = solved(scene, 24)
-    local = LocalPOD(n_clusters=1, n_modes=5).fit(scene, train).predict(train.forces)
-    corrected = HyperReducedPOD(5, 0.0, static_correction=True).fit(scene, train)
-    size = np.abs(local).max()
-    assert np.abs(corrected.predict(train.forces) - local).max() <= 1e-9 * size
-    few = HyperReducedPOD(5, 1e-2, static_correction=True).fit(scene, train)
-    assert len(few.cells_) < scene.mesh.n_cells
-    assert np.abs(few.predict(train.forces) - local).max() <= 0.03 * size
-    small = 1e-6 * train.forces
-    linear = LinearFEM().fit(scene, None).predict(small)
-    assert np.abs(few.predict(small) - linear).max() <= 1e-5 * np.abs(linear).max()
-
-
-def test_static_correction_needs_a_body_without_contact_and_sampled_parameters() -> None:
-    method = HyperReducedPOD(5, static_correction=True)
-    for name in ("liver-pressed", "beam-stiffness"):
-        assert "static correction" in str(method.supports(mor_bench.load_scene(name)))
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 3.0, 100.0])

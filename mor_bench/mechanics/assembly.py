@@ -280,7 +280,8 @@ class Assembler:
         self, u: Array, dofs: NDArray[np.uint32], batches: Batches, force: Array, values: Array
     ) -> tuple[float, float]:
         """Add forces and tangents of batches of cells; return energy and min det F."""
-        *cells, slots = batches
+        gradients, second, third, slots = batches
+        cells = gradients, second, third
         out: tuple[float, float]
         if not self._has_own_kernel:
             tangent = (slots, force, values) if len(values) else (None, force, None)

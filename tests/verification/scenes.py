@@ -6,11 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mor_bench
+from mor_bench.errors import SolverError
 from mor_bench.hard_cases.setups import material_table
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.discretisation import discretisation_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.sampling import draw_loads
 
 from .laws_and_elements import discretisation
 
@@ -47,3 +50,15 @@ def reactions(scene: Scene, forces: Array, u: Array) -> Array:
 def relative_residual(model: FullOrderModel, load: Array, u: Array) -> float:
     """Return the norm of the residual, relative to that of the load."""
     return float(np.linalg.norm(load - model.force(u).force) / np.linalg.norm(load))
+
+
+def solved(scene: Scene, n: int) -> Snapshots:
+    """Return samples of a scene that no dataset holds."""
+    loads = draw_loads(scene, 0, n)
+    found = FullOrderModel(scene).solve_many(
+        loads.nodal_forces(scene.patch_weights).reshape(n, -1)[:, scene.free_dofs]
+    )
+    answers = [answer for answer in found if not isinstance(answer, SolverError)]
+    assert len(answers) == n
+    displacements = np.array([answer.displacement for answer in answers])
+    return Snapshots(scene, loads, displacements, np.array([a.min_det_f for a in answers]))
