@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mor_bench.counting import count
 from mor_bench.errors import InvertedElementError
+from mor_bench.mechanics.compliance import project
 from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
@@ -54,7 +55,7 @@ def static_correction(
         Factor or `Compliance` of the full model's stiffness at rest K₀.
     reduced_factor : Factor
         Factor of ΦᵀK₀Φ.
-    modes : (n_free, r) float64
+    modes : (n_free, r) float64, in C order
         Φ.
     load : (n_free,) float64
         f, N.
@@ -64,8 +65,8 @@ def static_correction(
     (n_free,) float64
         Correction, m.
     """
-    count(multiply_adds=2 * modes.size)
-    return rest_factor.solve(load) - modes @ reduced_factor.solve(modes.T @ load)
+    count(multiply_adds=modes.size)
+    return rest_factor.solve(load) - modes @ reduced_factor.solve(project(modes, load[None])[0])
 
 
 def predict_corrected(
@@ -82,8 +83,8 @@ def predict_corrected(
     at rest. Raises `SolverError` if the reduced model has no valid equilibrium, or if its
     correction inverts cells.
     """
-    count(multiply_adds=2 * modes.size)
-    reduced = modes.T @ load
+    count(multiply_adds=modes.size)
+    reduced = project(modes, load[None])[0]
     if isinstance(problem, TensorProblem):
         q = problem.solve(reduced, tolerance)
     elif isinstance(problem, CubatureProblem):
