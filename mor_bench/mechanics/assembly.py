@@ -326,8 +326,7 @@ class Assembler:
         if self._plain:  # four calls fewer
             padded = np.zeros(self._n_padded)
             padded[: self.n_dofs] = u
-            found = self._sum(padded, self._dofs, force, np.zeros(0))
-            return State(force[: self.n_dofs], *found)
+            return State(force[: self.n_dofs], *self._sum(padded, self._dofs, force, np.zeros(0)))
         found = self._sum_all(self._total(u), force, np.zeros(0))
         return self._from_rest(u, self._at_unknowns(force), *found)
 
@@ -335,7 +334,8 @@ class Assembler:
         """Return the smallest det F at displacements ``u`` (n_dofs,), m."""
         if self._dofs.shape[1] != H8.n_nodes:
             return self.force(u).min_det_f
-        count(multiply_adds=self.n_cells * self._gradients.shape[1] * inversion.MULTIPLY_ADDS)
+        work = self.n_cells * self._gradients.shape[1] * inversion.MULTIPLY_ADDS
+        count(element_evaluations=self.n_cells, multiply_adds=work)
         return float(inversion.least_det_f(self._total(u), self._dofs, self._gradients))
 
     def _at_unknowns(self, force: Array) -> Array:

@@ -40,8 +40,8 @@ SEED = 0
 EPS = float(np.finfo(np.float64).eps)
 SOLVED = 1e-8
 """Relative error of displacements that the full-order model solved for, by its default."""
-DETERMINED = 10 * SOLVED
-"""Least relative singular value of a mode that is more than the error of the solver.
+DETERMINED = 10
+"""Least singular value of a mode that is more than the error of the solver, relative to that error.
 
 Below, that error turns the mode by more than a tenth. In a nearly incompressible body the cubature
 then matches mainly false changes of volume.
@@ -114,7 +114,9 @@ def pod(
     return found.truncated(n_modes, energy_tolerance)
 
 
-def accurate_modes(displacements: NDArray[np.float64], n_modes: int) -> NDArray[np.float64]:
+def accurate_modes(
+    displacements: NDArray[np.float64], n_modes: int, error: float = SOLVED
+) -> NDArray[np.float64]:
     """Return the leading modes (n, r) of solved displacements, without those of the solver's error.
 
     A cubature would be trained on that error, and leave such modes almost without stiffness.
@@ -122,17 +124,20 @@ def accurate_modes(displacements: NDArray[np.float64], n_modes: int) -> NDArray[
     Parameters
     ----------
     displacements : (n_samples, n) float64
-        Displacements, m, with a relative error of at most `SOLVED`.
+        Displacements, m.
     n_modes : int
         Capped with a warning.
+    error : float
+        Largest error of the displacements, relative to their size.
     """
     basis = pod(displacements, n_modes)
     sizes = basis.singular_values[: basis.modes.shape[1]]
-    kept = int((sizes > DETERMINED * sizes[0]).sum())
+    least = DETERMINED * error
+    kept = int((sizes > least * sizes[0]).sum())
     if kept < len(sizes):
         warnings.warn(
             f"{n_modes} modes were requested, but the samples determine {kept}: the others hold "
-            f"less than {DETERMINED:g} of the displacements, too near to the error of the solver. "
+            f"less than {least:g} of the displacements, too near to the error of the solver. "
             f"{kept} modes are used.",
             RankDeficientWarning,
             stacklevel=2,

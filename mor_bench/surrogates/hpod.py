@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.elements import GAUSS
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.reduction.basis import accurate_modes
+from mor_bench.reduction.basis import SOLVED, accurate_modes
 from mor_bench.reduction.cubature import ecsw_system, sparse_nnls, triangle
 from mor_bench.reduction.moved_points import PointRule, move_points
-from mor_bench.reduction.static_correction import corrected_snapshots, predict_corrected
+from mor_bench.reduction.static_correction import (
+    LINEAR_WEIGHT,
+    corrected_snapshots,
+    predict_corrected,
+)
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogates.cubature_states import States
@@ -25,7 +29,7 @@ from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced
 Array = NDArray[np.float64]
 
 MOVED_ONLY = "points move in H8 with full integration only, of a body without sampled parameters"
-CORRECTED_ONLY = "static correction is for loads on a body without contact and sampled parameters"
+CORRECTED_ONLY = "static correction is for loads on a body without contact or sampled parameters"
 
 
 @dataclass(eq=False)
@@ -74,7 +78,8 @@ class HyperReducedPOD(CubatureSurrogate):
             return super().choose_modes(scene, samples)
         linear = FullOrderModel(scene).rest_factor.solve(samples.free_forces.T).T
         snapshots = corrected_snapshots(samples.free_displacements, linear)
-        return accurate_modes(snapshots, self.value("n_modes"))
+        # The snapshots are smaller than the displacements, and the error of the solver is not.
+        return accurate_modes(snapshots, self.value("n_modes"), SOLVED / LINEAR_WEIGHT)
 
     def choose_cells(
         self, states: States, modes: Array, tolerance: float

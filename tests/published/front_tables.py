@@ -34,11 +34,6 @@ def scenes_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(dict.fromkeys(row["dataset"] for row in rows))
 
 
-def of_today(content: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows of all of today's methods."""
-    return [row for part in ("now", "more", "further") for row in content[part]]
-
-
 def fronts(source: str) -> str:
     """Show the fastest time for each error and the least error in each time, before and now."""
     content = content_of(source)
@@ -52,7 +47,8 @@ def fronts(source: str) -> str:
 
 def fronts_of_all(source: str) -> str:
     """Show the fastest time for each error and the least error in each time, of today's methods."""
-    rows = of_today(content_of(source))
+    content = content_of(source)
+    rows = content["now"] + content["more"]
     body = [
         [scene, *map(_with_method, _figures(points_on(scene, rows)))] for scene in scenes_of(rows)
     ]

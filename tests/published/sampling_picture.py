@@ -27,7 +27,7 @@ LOOKS: tuple[tuple[str, str, Line], ...] = (
 CAPTION = (
     "95th percentile of the relative error over the core-seconds of all solves, fits and choices, "
     "a panel per method and scene, a line per way to choose the training loads. Each point is the "
-    "median of the repetitions."
+    "median of the repetitions. Points above 100 % are cut off."
 )
 
 
@@ -42,8 +42,8 @@ def sampling_cost(source: str) -> Picture:
         deeper += bool(chosen[:, 1].min() < designs[:, 1].min())
         dearer += all(_reached_sooner(designs, point) for point in chosen)
     finding = (
-        f"Designs reach an error at least as soon as the adaptive choices in {dearer} of "
-        f"{len(panels)} panels, if they reach it; in {deeper} a choice ends below all designs"
+        f"No adaptive choice reaches an error sooner than a design in {dearer} of {len(panels)} "
+        f"panels; in {deeper} of them, one reaches smaller errors than all designs"
     )
     figure = new_figure(5.6, finding, "95th percentile of the error (%) over core-seconds")
     axes = figure.subplots(-(-len(panels) // 2), 2, squeeze=False).ravel()

@@ -224,6 +224,10 @@ METHODS: dict[str, tuple[dict[str, Any], float]] = {
     "pod-tensor": ({"n_modes": 12, "tolerance": 1e-12}, 1e-8),
     "sparse-polynomial": ({}, 1e-5),
     "hpod": ({"n_modes": 6, "cubature_tolerance": 0.0, "tolerance": 1e-12}, 1e-8),
+    "hpod, corrected": (
+        {"n_modes": 6, "cubature_tolerance": 0.0, "tolerance": 1e-12, "static_correction": True},
+        1e-8,
+    ),
     "ecm": ({"n_modes": 6, "cubature_tolerance": 1e-6, "tolerance": 1e-12}, 1e-3),
     "deim": ({"n_modes": 6, "n_force_modes": 10, "tolerance": 1e-12}, 5e-2),
     "deim, cells": ({"n_modes": 6, "n_force_modes": 10, "sampling": "cells"}, 5e-2),
