@@ -53,7 +53,7 @@ def test_methods_that_differ_in_words_are_compiled_apart(tmp_path: Path) -> None
         for group in groups
         for item in group.configurations[:1]
     ]
-    hpod = [("hpod", *pair) for pair in product(("points", "cells"), ("as-needed", "energy"))]
+    hpod = [("hpod", *pair) for pair in product(("points", "cells"), (False, True))]
     assert words == [("pod", None, None), *hpod]
     for group in groups:
         assert len({words_of(item.parameters) for item in group.configurations}) == 1
@@ -61,7 +61,7 @@ def test_methods_that_differ_in_words_are_compiled_apart(tmp_path: Path) -> None
 
 
 def words_of(parameters: Mapping[str, Any]) -> tuple[Any, Any]:
-    return parameters.get("sampling"), parameters.get("matching")
+    return parameters.get("sampling"), parameters.get("static_correction")
 
 
 @pytest.mark.slow
