@@ -1,8 +1,8 @@
 """The smallest det F of a mesh of hexahedra, without stresses.
 
-A check for inverted cells needs neither law nor force, so it has a third of the operations of
-`kernels.internal_force`. Layout and vectorisation are those of that file. The code is not shared:
-numba's cache notices changes only in a function's own file.
+A check for inverted cells needs neither law nor force, so it has 81 multiply-adds per Gauss point,
+where `kernels.internal_force` has 219. Layout and vectorisation are those of that file. The code is
+not shared: numba's cache notices changes only in a function's own file.
 """
 
 from __future__ import annotations

@@ -177,6 +177,10 @@ class GalerkinProblem(DenseProblem):
         product = stiffness_times(self.assembler.pattern, values, self.modes)
         return self._project(state), self.modes.T @ product
 
+    def solve(self, load: NDArray[np.float64], options: NewtonOptions) -> Solution:
+        """Solve from rest; see `solve_equilibrium`."""
+        return solve_equilibrium(self, load, options=options)
+
 
 class CubatureProblem(DenseProblem):
     """A reduced model over weighted quadrature points; work and memory do not depend on the mesh.

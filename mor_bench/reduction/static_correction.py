@@ -16,7 +16,7 @@ from mor_bench.errors import InvertedElementError
 from mor_bench.mechanics.compliance import project
 from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
+from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem
 from mor_bench.reduction.tensors import TensorProblem
 
@@ -87,10 +87,8 @@ def predict_corrected(
     reduced = project(modes, load[None])[0]
     if isinstance(problem, TensorProblem):
         q = problem.solve(reduced, tolerance)
-    elif isinstance(problem, CubatureProblem):
-        q = problem.solve(reduced, NewtonOptions(tolerance)).displacement
     else:
-        q = solve_equilibrium(problem, reduced, options=NewtonOptions(tolerance)).displacement
+        q = problem.solve(reduced, NewtonOptions(tolerance)).displacement
     u = rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))
     refuse_inverted(model, u)
     return u
