@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from mor_bench.analysis.frontier import Point, non_dominated
 from mor_bench.report.canvas import GREY, INK, LABEL, NOTE, Picture, dress, log_ticks, new_figure
 from mor_bench.report.method_styles import style_of
-from tests.published.front_tables import points_on, scenes_of
+from tests.published.front_tables import points_on, rows_of_today, scenes_of
 from tests.published.stored import content_of
 
 LEAST = 0.01
@@ -27,7 +27,7 @@ N_COLUMNS = 2
 def fronts_picture(source: str) -> Picture:
     """Draw error over time of all configurations, and the fronts before and now, per scene."""
     content = content_of(source)
-    now = content["now"] + content["more"]
+    now = rows_of_today(content)
     scenes, methods = scenes_of(now), list(dict.fromkeys(row["method"] for row in now))
     lower = [s for s in scenes if _front(s, now) != _front(s, content["now"])]
     finding = f"More methods lower today's front on {len(lower)} of {len(scenes)} scenes"

@@ -34,6 +34,11 @@ def scenes_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(dict.fromkeys(row["dataset"] for row in rows))
 
 
+def rows_of_today(content: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the rows of all of today's methods."""
+    return [row for run in ("now", "more", "further") for row in content[run]]
+
+
 def fronts(source: str) -> str:
     """Show the fastest time for each error and the least error in each time, before and now."""
     content = content_of(source)
@@ -48,7 +53,7 @@ def fronts(source: str) -> str:
 def fronts_of_all(source: str) -> str:
     """Show the fastest time for each error and the least error in each time, of today's methods."""
     content = content_of(source)
-    rows = content["now"] + content["more"]
+    rows = rows_of_today(content)
     body = [
         [scene, *map(_with_method, _figures(points_on(scene, rows)))] for scene in scenes_of(rows)
     ]
