@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import SolverError
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.static_correction import MOST_POISSON, softened
+from mor_bench.scene.materials import NeoHookean
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.linear_fem import LinearFEM
 from mor_bench.surrogates.local_pod import LocalPOD
+from tests.verification.laws_and_elements import LAWS
 from tests.verification.scenes import scene_of, solved
+
+Array = NDArray[np.float64]
 
 
 @pytest.mark.parametrize(
@@ -65,3 +72,55 @@ def test_a_body_that_the_static_correction_inverts_is_refused(
             continue
         assert model.force(u.ravel()[free]).min_det_f > 0
     assert refused > 0
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_another_poissons_ratio_leaves_the_shear_modulus(law: str) -> None:
+    material = LAWS[law]
+    changed = material.with_poisson(0.48)
+    assert changed.poisson_at_rest == pytest.approx(0.48, rel=1e-12)
+    assert changed.shape_parameters == pytest.approx(material.shape_parameters, rel=1e-12)
+    back = changed.with_poisson(material.poisson_at_rest)
+    assert back.parameters == pytest.approx(material.parameters, rel=1e-12)
+
+
+def test_only_nearly_incompressible_bodies_that_do_not_lock_are_softened() -> None:
+    scene = mor_bench.load_scene("beam-nearly-incompressible")
+    soft = softened(scene).material
+    assert scene.material is not None
+    assert soft is not None
+    assert soft.poisson_at_rest == pytest.approx(MOST_POISSON)
+    assert soft.shear_at_rest == pytest.approx(scene.material.shear_at_rest)
+    for name in ("beam-coarse", "liver-hex", "soft-arm"):
+        unchanged = mor_bench.load_scene(name)
+        assert softened(unchanged) is unchanged
+    locking = replace(mor_bench.load_scene("beam-coarse"), material=NeoHookean(500.0, 0.499))
+    assert softened(locking) is locking
+
+
+@pytest.mark.parametrize(
+    ("name", "knobs"),
+    [
+        ("hpod", {"n_modes": 20, "static_correction": True}),
+        ("local-pod", {"n_clusters": 1, "n_modes": 20}),
+        ("quadratic-manifold-pod", {"n_latent": 20}),
+        ("modal-derivatives", {"n_linear": 5, "n_modes": 20}),
+        ("quadratic-manifold", {"n_modes": 5}),
+    ],
+)
+def test_softer_volume_lowers_the_errors_of_a_nearly_incompressible_body(
+    name: str, knobs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = mor_bench.load_dataset("beam-nearly-incompressible", limit=160)
+    sizes = np.linalg.norm(data.test.displacements, axis=(1, 2))
+
+    def errors() -> Array:
+        method = mor_bench.load_method(name, **knobs).fit(data.scene, data.train)
+        apart = method.predict(data.test.forces) - data.test.displacements
+        return np.asarray(np.linalg.norm(apart, axis=(1, 2)) / sizes)
+
+    soft = errors()
+    monkeypatch.setattr("mor_bench.reduction.static_correction.MOST_POISSON", 0.5)
+    true = errors()
+    assert soft.max() < 0.6 * true.max()
+    assert np.median(soft) < 0.7 * np.median(true)

@@ -4,9 +4,14 @@ A basis of few modes cannot represent the local dent under every load. At small 
 back-solve with the stiffness at rest gives the rest. In linear dynamics this is called static
 correction, residual flexibility or the mode acceleration method (MacNeal, Computers & Structures 1
 (1971) 581-601; Dickens, Nakagawa, Wittbrodt, ibid. 62 (1997) 985-998).
+
+With the correction, the reduced problem gives only the nonlinear part of a displacement. In a
+nearly incompressible body this allows a softer volumetric law, see `softened`.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +20,34 @@ from mor_bench.counting import count
 from mor_bench.errors import InvertedElementError
 from mor_bench.mechanics.compliance import project
 from mor_bench.mechanics.linear import Factor
+from mor_bench.mechanics.locking import locking_risk
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem
 from mor_bench.reduction.tensors import TensorProblem
+from mor_bench.scene.scene import Scene
 
 LINEAR_WEIGHT = 0.2
 """Weight of the linear responses among the snapshots. The static correction supplies them, but the
 basis must be able to rotate and bend them."""
+
+MOST_POISSON = 0.48
+"""Largest Poisson's ratio of a reduced problem with static correction, see `softened`."""
+
+
+def softened(scene: Scene) -> Scene:
+    """Return the scene of a reduced problem with static correction.
+
+    Few modes cannot keep the volume of each cell when they bend. The penalty on these changes then
+    stiffens the reduced problem, as it locks cells of low order. Here a body that does not lock has
+    a Poisson's ratio of at most `MOST_POISSON` at rest, with the same shear modulus. The linear
+    response, to which its answer is added, has the true one. The nonlinear part hardly depends on
+    it, because it keeps the volume with either.
+    """
+    material = scene.material
+    if material is None or material.poisson_at_rest <= MOST_POISSON or locking_risk(scene):
+        return scene
+    return replace(scene, material=material.with_poisson(MOST_POISSON))
 
 
 def corrected_snapshots(

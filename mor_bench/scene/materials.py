@@ -6,9 +6,9 @@ Selective integration needs this split: it uses the cell's mean gradient in the 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import hypot
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from mor_bench.specs import (
     FibreMaterial,
@@ -43,6 +43,10 @@ class Material(ABC):
         """Young's modulus at small strains, Pa; without fibres."""
         return 2.0 * (1.0 + self.poisson_at_rest) * self.shear_at_rest
 
+    @abstractmethod
+    def with_poisson(self, poisson: float) -> Self:
+        """Return the law with another Poisson's ratio at rest, and the rest of it unchanged."""
+
     @property
     def parameters(self) -> tuple[float, ...]:
         """Parameters of the law's function."""
@@ -69,6 +73,11 @@ def poisson_of(bulk_pa: float, shear_pa: float) -> float:
     return (3 * bulk_pa - 2 * shear_pa) / (2 * (3 * bulk_pa + shear_pa))
 
 
+def bulk_of(poisson: float, shear_pa: float) -> float:
+    """Return κ = 2μ (1 + ν) / (3 (1 - 2ν)), Pa."""
+    return 2 * shear_pa * (1 + poisson) / (3 * (1 - 2 * poisson))
+
+
 @dataclass(frozen=True)
 class _TwoLame(Material):
     young_pa: float
@@ -91,6 +100,9 @@ class _TwoLame(Material):
     def lame_mu(self) -> float:
         """μ, Pa."""
         return lame_parameters(self.young_pa, self.poisson)[1]
+
+    def with_poisson(self, poisson: float) -> Self:
+        return replace(self, young_pa=2 * self.lame_mu * (1 + poisson), poisson=poisson)
 
     def _scaled(self, volume: float, shape: float) -> tuple[float, ...]:
         return volume * self.lame_lambda, shape * self.lame_mu
@@ -123,8 +135,23 @@ class Corotational(_TwoLame):
     law = 5
 
 
+class _WithBulk(Material):
+    """A law whose volumetric part is κ/2 (J - 1)²; a subclass has the field κ."""
+
+    bulk_pa: float
+
+    @property
+    def poisson_at_rest(self) -> float:
+        """Poisson's ratio at small strains; without fibres."""
+        return poisson_of(self.bulk_pa, self.shear_at_rest)
+
+    def with_poisson(self, poisson: float) -> Self:
+        bulk = bulk_of(poisson, self.shear_at_rest)
+        return type(self)(**{**vars(self), "bulk_pa": bulk})
+
+
 @dataclass(frozen=True)
-class MooneyRivlin(Material):
+class MooneyRivlin(_WithBulk):
     """W = c10 (J^(-2/3) I₁ - 3) + c01 (J^(-4/3) I₂ - 3) + κ/2 (J - 1)².
 
     Parameters
@@ -147,13 +174,9 @@ class MooneyRivlin(Material):
     def shear_at_rest(self) -> float:
         return 2 * (self.c10_pa + self.c01_pa)
 
-    @property
-    def poisson_at_rest(self) -> float:
-        return poisson_of(self.bulk_pa, self.shear_at_rest)
-
 
 @dataclass(frozen=True)
-class Ogden(Material):
+class Ogden(_WithBulk):
     """W = Σ μ_p/α_p (λ̄₁^α_p + λ̄₂^α_p + λ̄₃^α_p - 3) + κ/2 (J - 1)², with λ̄ = J^(-1/3) λ.
 
     Parameters
@@ -180,13 +203,9 @@ class Ogden(Material):
     def shear_at_rest(self) -> float:
         return 0.5 * sum(mu * alpha for mu, alpha in zip(self.mu_pa, self.alpha, strict=True))
 
-    @property
-    def poisson_at_rest(self) -> float:
-        return poisson_of(self.bulk_pa, self.shear_at_rest)
-
 
 @dataclass(frozen=True)
-class Yeoh(Material):
+class Yeoh(_WithBulk):
     """W = c10 x + c20 x² + c30 x³ + κ/2 (J - 1)², with x = J^(-2/3) I₁ - 3.
 
     Parameters
@@ -211,13 +230,9 @@ class Yeoh(Material):
     def shear_at_rest(self) -> float:
         return 2 * self.c10_pa
 
-    @property
-    def poisson_at_rest(self) -> float:
-        return poisson_of(self.bulk_pa, self.shear_at_rest)
-
 
 @dataclass(frozen=True)
-class HolzapfelGasserOgden(Material):
+class HolzapfelGasserOgden(_WithBulk):
     """W = c10 (Ī₁ - 3) + κ/2 (J - 1)² + Σ k1/(2 k2) (exp(k2 ⟨x⟩²) - 1), x = N:C̄ - 1.
 
     The sum is over families of fibres, C̄ = J^(-2/3) C, and ⟨x⟩ = max(x, 0), because fibres carry
@@ -259,11 +274,6 @@ class HolzapfelGasserOgden(Material):
     @property
     def shear_at_rest(self) -> float:
         return 2 * self.c10_pa
-
-    @property
-    def poisson_at_rest(self) -> float:
-        """Poisson's ratio of the matrix at small strains."""
-        return poisson_of(self.bulk_pa, self.shear_at_rest)
 
 
 def make_material(

@@ -25,7 +25,7 @@ from mor_bench.reduction.curved import (
     curved_system,
 )
 from mor_bench.reduction.galerkin import GalerkinProblem, stiffness_times
-from mor_bench.reduction.static_correction import refuse_inverted
+from mor_bench.reduction.static_correction import refuse_inverted, softened
 from mor_bench.reduction.weighted_cells import weighted_cells
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -115,12 +115,16 @@ class CurvedPOD(Surrogate):
             for row in _spread(displacements, self.n_cubature_snapshots):
                 c, slopes = curve.at(latent[row])
                 states.append((offsets[row] + modes @ c, self.directions(slopes)))
-            system = curved_system(model, modes, states)
+            reduced = FullOrderModel(self._reduced_scene(scene))
+            system = curved_system(reduced, modes, states)
             weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
         cells = np.flatnonzero(weights)
         secondary = np.ascontiguousarray(modes[:, primary.shape[1] :])
         kept = {"cells": cells, "weights": weights[cells]}
         return {"primary": primary, "secondary": secondary, **kept, **arrays}
+
+    def _reduced_scene(self, scene: Scene) -> Scene:
+        return softened(scene) if self.static_correction else scene
 
     def prepare(self, scene: Scene, model: Arrays) -> None:
         n_free = len(scene.free_dofs)
@@ -130,7 +134,7 @@ class CurvedPOD(Surrogate):
         self.cells_ = take_array(model, "cells", (None,), np.int64)
         weights = take_array(model, "weights", (len(self.cells_),))
         self.curve_ = self.take_map(model, primary.shape[1], self.space_.shape[1])
-        assembler, self.rows_ = weighted_cells(scene, self.cells_, weights)
+        assembler, self.rows_ = weighted_cells(self._reduced_scene(scene), self.cells_, weights)
         sampled = GalerkinProblem(assembler, self.space_[self.rows_])
         self.curved_ = CurvedModel(sampled, self.curve_)
         self.curved_.linear.prepare()

@@ -19,6 +19,7 @@ from mor_bench.reduction.static_correction import (
     LINEAR_WEIGHT,
     corrected_snapshots,
     predict_corrected,
+    softened,
 )
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -80,6 +81,9 @@ class HyperReducedPOD(CubatureSurrogate):
         snapshots = corrected_snapshots(samples.free_displacements, linear)
         # The snapshots are smaller than the displacements, and the error of the solver is not.
         return accurate_modes(snapshots, self.value("n_modes"), SOLVED / LINEAR_WEIGHT)
+
+    def reduced_scene(self, scene: Scene) -> Scene:
+        return softened(scene) if self.static_correction else scene
 
     def choose_cells(
         self, states: States, modes: Array, tolerance: float

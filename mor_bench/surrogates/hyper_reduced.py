@@ -108,6 +108,10 @@ class CubatureSurrogate(Surrogate):
         """Return the modes (n_free, r)."""
         return accurate_modes(samples.free_displacements, self.value("n_modes"))
 
+    def reduced_scene(self, scene: Scene) -> Scene:
+        """Return the scene whose law the cells have."""
+        return scene
+
     @abstractmethod
     def choose_cells(
         self, states: States, modes: Array, tolerance: float
@@ -124,7 +128,8 @@ class CubatureSurrogate(Surrogate):
         if tolerance == 0:
             whole = {"cells": np.arange(scene.mesh.n_cells), "weights": np.ones(scene.mesh.n_cells)}
             return {"modes": modes, **whole}
-        chosen = self.choose_cells(*self._matched(scene, samples, modes), tolerance)
+        matched = self._matched(self.reduced_scene(scene), samples, modes)
+        chosen = self.choose_cells(*matched, tolerance)
         return {"modes": modes, **chosen}
 
     def _matched(self, scene: Scene, samples: Snapshots, modes: Array) -> tuple[States, Array]:
@@ -155,7 +160,7 @@ class CubatureSurrogate(Surrogate):
             )
         self.subspace_ = Subspace(scene, self.modes_)
         self._on_nodes = nodal(scene, self.modes_)
-        self.problem_ = self._problem(scene)
+        self.problem_ = self._problem(self.reduced_scene(scene))
         self.problem_.prepare()
         if scene.contact:
             from mor_bench.reduction.pressed_modes import PressedModes  # only such scenes need it

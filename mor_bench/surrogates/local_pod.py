@@ -17,7 +17,7 @@ from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
-from mor_bench.reduction.static_correction import corrected_snapshots, predict_corrected
+from mor_bench.reduction.static_correction import corrected_snapshots, predict_corrected, softened
 from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -79,10 +79,11 @@ class LocalPOD(Surrogate):
         centroids, labels = _clusters(directions, self.n_clusters)
         bases = self._bases(samples.free_displacements, linear, directions, centroids, labels)
         polynomials: dict[str, Array] = {}
+        reduced = FullOrderModel(softened(scene))
         for cluster, basis in enumerate(bases):
-            if polynomial_pays(model, basis.shape[1], len(bases)):
+            if polynomial_pays(reduced, basis.shape[1], len(bases)):
                 own = samples.free_displacements[labels == cluster][:N_WATCHED]
-                problem = TensorProblem.of_modes(model, basis, own @ basis)
+                problem = TensorProblem.of_modes(reduced, basis, own @ basis)
                 polynomials |= {
                     f"{name}.{cluster}": array for name, array in problem.arrays.items()
                 }
@@ -128,8 +129,9 @@ class LocalPOD(Surrogate):
         self.bases_ = [
             np.ascontiguousarray(basis) for basis in np.split(modes, np.cumsum(sizes)[:-1], axis=1)
         ]
+        reduced = FullOrderModel(softened(scene))
         self.problems_ = [
-            galerkin_or_polynomial(scene, self.model_, basis, _of_cluster(model, cluster))
+            galerkin_or_polynomial(scene, reduced, basis, _of_cluster(model, cluster))
             for cluster, basis in enumerate(self.bases_)
         ]
         self.compliance_ = Compliance(self.model_)

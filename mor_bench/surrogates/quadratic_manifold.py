@@ -20,7 +20,7 @@ from mor_bench.reduction.cubature import sparse_nnls
 from mor_bench.reduction.derivative_modes import linear_modes, modal_derivatives
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.manifold import ManifoldProblem, QuadraticManifold, manifold_system
-from mor_bench.reduction.static_correction import refuse_inverted, static_correction
+from mor_bench.reduction.static_correction import refuse_inverted, softened, static_correction
 from mor_bench.reduction.weighted_cells import weighted_cells
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -73,8 +73,9 @@ class QuadraticManifoldGalerkin(Surrogate):
         manifold = QuadraticManifold(modes, modal_derivatives(full, modes))
         weights = np.ones(scene.mesh.n_cells)
         if self.cubature_tolerance > 0:
-            states = _states_under_loads(full, manifold)
-            system = manifold_system(full.assembler, full.cell_dofs, manifold, states)
+            reduced = FullOrderModel(softened(scene))
+            states = _states_under_loads(reduced, manifold)
+            system = manifold_system(reduced.assembler, reduced.cell_dofs, manifold, states)
             weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
         cells = np.flatnonzero(weights)
         return {
@@ -88,7 +89,7 @@ class QuadraticManifoldGalerkin(Surrogate):
         self.cells_, self.weights_ = model["cells"], model["weights"]
         modes = take_array(model, "modes", (len(scene.free_dofs), None))
         self.manifold_ = QuadraticManifold(modes, model["derivatives"])
-        assembler, rows = weighted_cells(scene, self.cells_, self.weights_)
+        assembler, rows = weighted_cells(softened(scene), self.cells_, self.weights_)
         self.linear_ = GalerkinProblem(assembler, modes[rows])
         self.sampled_ = QuadraticManifold(modes[rows], self.manifold_.derivatives[rows])
         self.model_ = FullOrderModel(scene)

@@ -8,8 +8,8 @@ not know all of them. Networks on grids and meshes are left out, because they ne
 trainings. The regression has another name today, which says what it is told. Hyper-reduction runs
 without static correction, which the earlier version lacks.
 
-Two more runs have methods of today that the first two leave out. Runs that the file has already are
-not repeated, so that the same command continues after an interruption.
+Two more runs have methods of today that the first two leave out. Scenes of a run that the file has
+already are not repeated, so that the same command continues after an interruption.
 """
 
 from __future__ import annotations
@@ -69,11 +69,13 @@ TEST_SETS = re.compile(r"^\[tests\]\n(?:[^\[\n].*\n|\n)*", re.MULTILINE)
 ERRORS = ("rel_l2_median", "rel_l2_p95", "rel_l2_max")
 
 
-def rows_of(code: Path, methods: tuple[str, ...], limit: int, folder: Path) -> list[dict[str, Any]]:
+def rows_of(
+    code: Path, methods: tuple[str, ...], names: list[str], limit: int, folder: Path
+) -> list[dict[str, Any]]:
     """Run a version of the suite; return error and time of each configuration that ended."""
     folder.mkdir()
     scenes = []
-    for name in SCENES:
+    for name in names:
         text = (ROOT / f"datasets/{name}.toml").read_text(encoding="utf-8")
         (folder / f"{name}.toml").write_text(TEST_SETS.sub("", text), encoding="utf-8")
         scenes.append(str(folder / f"{name}.toml"))
@@ -121,8 +123,11 @@ def main(
                 "further": (ROOT, FURTHER),
             }
             for name, (code, methods) in runs.items():
-                if name not in found:
-                    found[name] = rows_of(code, methods, limit, folder / name)
+                rows = found.get(name, [])
+                measured = {row["dataset"] for row in rows}
+                if lacking := [scene for scene in SCENES if scene not in measured]:
+                    rows = [*rows, *rows_of(code, methods, lacking, limit, folder / name)]
+                    found[name] = sorted(rows, key=lambda row: SCENES.index(row["dataset"]))
                     write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
         finally:
             subprocess.run(["git", "worktree", "remove", "--force", old], cwd=ROOT, check=True)
