@@ -32,7 +32,7 @@ from tests.published.network_size_tables import (
     paper_size_latency,
     training_speed,
 )
-from tests.published.projection_tables import projections, reconstructions
+from tests.published.projection_tables import projections, reconstructions, softened_volume
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.sampling_tables import learning_curves
@@ -391,6 +391,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "timed-work": timed_work,
     "projections": projections,
     "reconstructions": reconstructions,
+    "softened-volume": softened_volume,
     "learning-curves": learning_curves,
     "training-iterations": training_iterations,
     "training-samples": training_samples,

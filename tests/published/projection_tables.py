@@ -45,6 +45,21 @@ def reconstructions(source: str, dataset: str) -> str:
     return markdown(headings, body)
 
 
+def softened_volume(source: str, size: str) -> str:
+    """Show errors by Poisson's ratio of bodies and of their reduced problems, of one size."""
+    rows = [row for row in content_of(source)["rows"] if row["size"] == int(size)]
+    least = sorted({row["reduced"] for row in rows if row["reduced"] < row["poisson"]})
+    headings = ["scene", "ν of the body", "the same, %", *(f"{r:g}, %" for r in reversed(least))]
+    of = {(row["dataset"], row["poisson"], row["reduced"]): row["error"] for row in rows}
+    body = []
+    for scene, poisson in dict.fromkeys((row["dataset"], row["poisson"]) for row in rows):
+        spreads = (of.get((scene, poisson, r)) for r in reversed(least) if r < poisson)
+        cells = [" / ".join(_percents(s)) for s in (of[scene, poisson, poisson], *spreads) if s]
+        missing = [DASH] * (1 + len(least) - len(cells))
+        body.append([f"`{scene}`", f"{poisson:g}", cells[0], *missing, *cells[1:]])
+    return markdown(headings, body)
+
+
 def _percents(spread: Mapping[str, float | None]) -> list[str]:
     found = (spread[name] for name in ("median", "p95", "max"))
     return ["∞" if value is None else number(100 * value) for value in found]
