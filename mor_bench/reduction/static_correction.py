@@ -34,15 +34,19 @@ basis must be able to rotate and bend them."""
 MOST_POISSON = 0.48
 """Largest Poisson's ratio of a reduced problem with static correction, see `softened`."""
 
+SOFTENED = "softened"
+"""Name of an array that a model has if its reduced problem is that of the softened scene."""
+
 
 def softened(scene: Scene) -> Scene:
-    """Return the scene of a reduced problem with static correction.
+    """Return a scene with a softer volumetric law, for reduced problems with static correction.
 
     Few modes cannot keep the volume of each cell when they bend. The penalty on these changes then
-    stiffens the reduced problem, as it locks cells of low order. Here a body that does not lock has
-    a Poisson's ratio of at most `MOST_POISSON` at rest, with the same shear modulus. The linear
-    response, to which its answer is added, has the true one. The nonlinear part hardly depends on
-    it, because it keeps the volume with either.
+    stiffens the reduced problem, as it locks cells of low order. Here a body whose cells do not
+    lock has a Poisson's ratio of at most `MOST_POISSON` at rest, with the same shear modulus. The
+    linear response, to which the answer is added, has the true one. The nonlinear part hardly
+    depends on it, because it keeps the volume with either. A scene that needs no change is returned
+    itself.
     """
     material = scene.material
     if material is None or material.poisson_at_rest <= MOST_POISSON or locking_risk(scene):

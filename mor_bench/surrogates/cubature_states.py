@@ -14,6 +14,7 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.mechanics.parametric import ParametricModel
 from mor_bench.reduction.galerkin import GalerkinProblem
+from mor_bench.reduction.static_correction import softened
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 
@@ -29,6 +30,9 @@ FAR = 10.0
 
 With 10 and 20 modes, it is below 6 on beams with ν = 0.4, and above 40 with ν = 0.499.
 """
+N_JUDGED = 100
+"""Largest number of snapshots that decide about the law of the reduced problem."""
+
 TOLERANCE = 1e-4
 """Tolerance of the training equilibria; their cubature errs more."""
 
@@ -73,6 +77,20 @@ def are_far(states: States, loads: Array, modes: Array) -> bool:
         if size > 0
     ]
     return bool(residuals) and float(np.median(residuals)) > FAR
+
+
+def softened_if_far(scene: Scene, samples: Snapshots, modes: Array) -> Scene:
+    """Return the scene with a softer volumetric law if projected snapshots are far, see `are_far`.
+
+    If the modes keep the volume, as those of a tube under pressure do, the scene's own law errs
+    less, and the scene is returned as it is.
+    """
+    soft = softened(scene)
+    if soft is scene:
+        return scene
+    loads = samples.free_forces[training_rows(samples.free_displacements, N_JUDGED)]
+    states = projected_states(scene, samples, modes, N_JUDGED)
+    return soft if are_far(states, loads, modes) else scene
 
 
 def equilibria(states: States, loads: Array, modes: Array) -> States:

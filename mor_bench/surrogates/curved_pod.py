@@ -25,11 +25,12 @@ from mor_bench.reduction.curved import (
     curved_system,
 )
 from mor_bench.reduction.galerkin import GalerkinProblem, stiffness_times
-from mor_bench.reduction.static_correction import refuse_inverted, softened
+from mor_bench.reduction.static_correction import SOFTENED, refuse_inverted, softened
 from mor_bench.reduction.weighted_cells import weighted_cells
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.cubature_states import softened_if_far
 from mor_bench.surrogates.free_dofs import answer_each
 
 Array = NDArray[np.float64]
@@ -108,23 +109,23 @@ class CurvedPOD(Surrogate):
         secondary = np.linalg.qr(rest - primary @ (primary.T @ rest))[0]
         modes = np.hstack([primary, secondary])
         arrays, latent = self.fit_map(scene, samples, targets @ modes, primary.shape[1])
-        weights = np.ones(scene.mesh.n_cells)
+        weights, reduced = np.ones(scene.mesh.n_cells), scene
+        if self.static_correction:
+            reduced = softened_if_far(scene, samples, primary)
         if self.cubature_tolerance > 0:
             curve = self.take_map(arrays, primary.shape[1], modes.shape[1])
             states = []
             for row in _spread(displacements, self.n_cubature_snapshots):
                 c, slopes = curve.at(latent[row])
                 states.append((offsets[row] + modes @ c, self.directions(slopes)))
-            reduced = FullOrderModel(self._reduced_scene(scene))
-            system = curved_system(reduced, modes, states)
+            system = curved_system(FullOrderModel(reduced), modes, states)
             weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
         cells = np.flatnonzero(weights)
         secondary = np.ascontiguousarray(modes[:, primary.shape[1] :])
         kept = {"cells": cells, "weights": weights[cells]}
+        if reduced is not scene:
+            kept[SOFTENED] = np.ones(1)
         return {"primary": primary, "secondary": secondary, **kept, **arrays}
-
-    def _reduced_scene(self, scene: Scene) -> Scene:
-        return softened(scene) if self.static_correction else scene
 
     def prepare(self, scene: Scene, model: Arrays) -> None:
         n_free = len(scene.free_dofs)
@@ -133,8 +134,9 @@ class CurvedPOD(Surrogate):
         self.space_ = np.hstack([primary, take_array(model, "secondary", (n_free, None))])
         self.cells_ = take_array(model, "cells", (None,), np.int64)
         weights = take_array(model, "weights", (len(self.cells_),))
+        reduced = softened(scene) if SOFTENED in model else scene
         self.curve_ = self.take_map(model, primary.shape[1], self.space_.shape[1])
-        assembler, self.rows_ = weighted_cells(self._reduced_scene(scene), self.cells_, weights)
+        assembler, self.rows_ = weighted_cells(reduced, self.cells_, weights)
         sampled = GalerkinProblem(assembler, self.space_[self.rows_])
         self.curved_ = CurvedModel(sampled, self.curve_)
         self.curved_.linear.prepare()

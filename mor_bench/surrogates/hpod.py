@@ -19,11 +19,10 @@ from mor_bench.reduction.static_correction import (
     LINEAR_WEIGHT,
     corrected_snapshots,
     predict_corrected,
-    softened,
 )
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogates.cubature_states import States
+from mor_bench.surrogates.cubature_states import States, softened_if_far
 from mor_bench.surrogates.free_dofs import answer_each
 from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced_points
 
@@ -82,8 +81,8 @@ class HyperReducedPOD(CubatureSurrogate):
         # The snapshots are smaller than the displacements, and the error of the solver is not.
         return accurate_modes(snapshots, self.value("n_modes"), SOLVED / LINEAR_WEIGHT)
 
-    def reduced_scene(self, scene: Scene) -> Scene:
-        return softened(scene) if self.static_correction else scene
+    def reduced_scene(self, scene: Scene, samples: Snapshots, modes: Array) -> Scene:
+        return softened_if_far(scene, samples, modes) if self.static_correction else scene
 
     def choose_cells(
         self, states: States, modes: Array, tolerance: float

@@ -20,6 +20,7 @@ from mor_bench.reduction.basis import accurate_modes
 from mor_bench.reduction.galerkin import CubatureProblem
 from mor_bench.reduction.points import ReducedPoints
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto
+from mor_bench.reduction.static_correction import SOFTENED, softened
 from mor_bench.reduction.subspace import Subspace, extent_of
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.scene_at import scale_of
@@ -108,8 +109,8 @@ class CubatureSurrogate(Surrogate):
         """Return the modes (n_free, r)."""
         return accurate_modes(samples.free_displacements, self.value("n_modes"))
 
-    def reduced_scene(self, scene: Scene) -> Scene:
-        """Return the scene whose law the cells have."""
+    def reduced_scene(self, scene: Scene, samples: Snapshots, modes: Array) -> Scene:
+        """Return the scene whose law the cells have: the given one, or a softened one."""
         return scene
 
     @abstractmethod
@@ -125,12 +126,12 @@ class CubatureSurrogate(Surrogate):
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         tolerance = self.value("cubature_tolerance")
         modes = self.choose_modes(scene, samples)
+        reduced = self.reduced_scene(scene, samples, modes)
+        kept = {"modes": modes} if reduced is scene else {"modes": modes, SOFTENED: np.ones(1)}
         if tolerance == 0:
             whole = {"cells": np.arange(scene.mesh.n_cells), "weights": np.ones(scene.mesh.n_cells)}
-            return {"modes": modes, **whole}
-        matched = self._matched(self.reduced_scene(scene), samples, modes)
-        chosen = self.choose_cells(*matched, tolerance)
-        return {"modes": modes, **chosen}
+            return {**kept, **whole}
+        return {**kept, **self.choose_cells(*self._matched(reduced, samples, modes), tolerance)}
 
     def _matched(self, scene: Scene, samples: Snapshots, modes: Array) -> tuple[States, Array]:
         """Return training states, and the modes on which their forces are matched."""
@@ -160,7 +161,7 @@ class CubatureSurrogate(Surrogate):
             )
         self.subspace_ = Subspace(scene, self.modes_)
         self._on_nodes = nodal(scene, self.modes_)
-        self.problem_ = self._problem(self.reduced_scene(scene))
+        self.problem_ = self._problem(softened(scene) if SOFTENED in model else scene)
         self.problem_.prepare()
         if scene.contact:
             from mor_bench.reduction.pressed_modes import PressedModes  # only such scenes need it

@@ -17,11 +17,17 @@ from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
-from mor_bench.reduction.static_correction import corrected_snapshots, predict_corrected, softened
+from mor_bench.reduction.static_correction import (
+    SOFTENED,
+    corrected_snapshots,
+    predict_corrected,
+    softened,
+)
 from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.cubature_states import softened_if_far
 from mor_bench.surrogates.free_dofs import answer_each, galerkin_or_polynomial
 
 Array = NDArray[np.float64]
@@ -78,17 +84,18 @@ class LocalPOD(Surrogate):
         directions = _directions(linear @ axes)
         centroids, labels = _clusters(directions, self.n_clusters)
         bases = self._bases(samples.free_displacements, linear, directions, centroids, labels)
-        polynomials: dict[str, Array] = {}
-        reduced = FullOrderModel(softened(scene))
+        of_clusters: dict[str, Array] = {}
+        soft = FullOrderModel(softened(scene))
         for cluster, basis in enumerate(bases):
+            own, arrays, reduced = samples[np.flatnonzero(labels == cluster)], {}, model
+            if softened_if_far(scene, own, basis) is not scene:
+                arrays, reduced = {SOFTENED: np.ones(1)}, soft
             if polynomial_pays(reduced, basis.shape[1], len(bases)):
-                own = samples.free_displacements[labels == cluster][:N_WATCHED]
-                problem = TensorProblem.of_modes(reduced, basis, own @ basis)
-                polynomials |= {
-                    f"{name}.{cluster}": array for name, array in problem.arrays.items()
-                }
+                watched = own.free_displacements[:N_WATCHED] @ basis
+                arrays |= TensorProblem.of_modes(reduced, basis, watched).arrays
+            of_clusters |= {f"{name}.{cluster}": array for name, array in arrays.items()}
         return {
-            **polynomials,
+            **of_clusters,
             "to_coordinates": model.rest_factor.solve(axes),
             "centroids": centroids,
             "sizes": np.array([basis.shape[1] for basis in bases]),
@@ -129,10 +136,11 @@ class LocalPOD(Surrogate):
         self.bases_ = [
             np.ascontiguousarray(basis) for basis in np.split(modes, np.cumsum(sizes)[:-1], axis=1)
         ]
-        reduced = FullOrderModel(softened(scene))
+        soft = FullOrderModel(softened(scene))
+        arrays = [_of_cluster(model, cluster) for cluster in range(n_clusters)]
         self.problems_ = [
-            galerkin_or_polynomial(scene, reduced, basis, _of_cluster(model, cluster))
-            for cluster, basis in enumerate(self.bases_)
+            galerkin_or_polynomial(scene, soft if SOFTENED in own else self.model_, basis, own)
+            for basis, own in zip(self.bases_, arrays, strict=True)
         ]
         self.compliance_ = Compliance(self.model_)
         for problem in self.problems_:
