@@ -11,7 +11,9 @@ nearly incompressible body this allows a softer volumetric law, see `softened`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +37,7 @@ MOST_POISSON = 0.48
 """Largest Poisson's ratio of a reduced problem with static correction, see `softened`."""
 
 SOFTENED = "softened"
-"""Name of an array that a model has if its reduced problem is that of the softened scene."""
+"""Array of a fitted model whose reduced problem is that of the softened scene."""
 
 
 def softened(scene: Scene) -> Scene:
@@ -44,14 +46,29 @@ def softened(scene: Scene) -> Scene:
     Few modes cannot keep the volume of each cell when they bend. The penalty on these changes then
     stiffens the reduced problem, as it locks cells of low order. Here a body whose cells do not
     lock has a Poisson's ratio of at most `MOST_POISSON` at rest, with the same shear modulus. The
-    linear response, to which the answer is added, has the true one. The nonlinear part hardly
-    depends on it, because it keeps the volume with either. A scene that needs no change is returned
+    linear response, to which the answer is added, has the true one. The nonlinear part depends
+    little on it, because it keeps the volume with either. A scene that needs no change is returned
     itself.
     """
     material = scene.material
     if material is None or material.poisson_at_rest <= MOST_POISSON or locking_risk(scene):
         return scene
     return replace(scene, material=material.with_poisson(MOST_POISSON))
+
+
+def model_of(scene: Scene, model: FullOrderModel) -> FullOrderModel:
+    """Return a full-order model of a scene: the given one if it is the model of this scene."""
+    return model if model.scene is scene else FullOrderModel(scene)
+
+
+def mark_of(scene: Scene, reduced: Scene) -> dict[str, NDArray[np.float64]]:
+    """Return the array that tells `marked_scene` which scene a reduced problem has."""
+    return {} if reduced is scene else {SOFTENED: np.ones(1)}
+
+
+def marked_scene(scene: Scene, arrays: Mapping[str, NDArray[Any]]) -> Scene:
+    """Return the scene of the reduced problem of a model with these arrays."""
+    return softened(scene) if SOFTENED in arrays else scene
 
 
 def corrected_snapshots(

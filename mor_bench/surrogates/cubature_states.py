@@ -30,8 +30,14 @@ FAR = 10.0
 
 With 10 and 20 modes, it is below 6 on beams with ν = 0.4, and above 40 with ν = 0.499.
 """
+LOCKED = 1.0
+"""The same residual above which modes with static correction need a softer volumetric law.
+
+With 10 to 80 modes, it is above 1.5 on a beam and a liver with ν = 0.49 and 0.499, and below 0.03
+on an artery under pressure, whose modes keep the volume.
+"""
 N_JUDGED = 100
-"""Largest number of snapshots that decide about the law of the reduced problem."""
+"""Largest number of snapshots that decide about this law."""
 
 TOLERANCE = 1e-4
 """Tolerance of the training equilibria; their cubature errs more."""
@@ -68,6 +74,26 @@ def are_far(states: States, loads: Array, modes: Array) -> bool:
     A part of the displacement outside of the span hardly changes the displacement. In a nearly
     incompressible body, it changes the volume of cells, and the forces by orders of magnitude.
     """
+    return _residual(states, loads, modes) > FAR
+
+
+def softened_if_locked(model: FullOrderModel, samples: Snapshots, modes: Array) -> Scene:
+    """Return the softened scene if the modes do not keep the volume, see `are_far`.
+
+    If they do, as those of a tube under pressure, the scene's own law errs less. The scene is then
+    returned as it is.
+    """
+    scene, displacements = model.scene, samples.free_displacements
+    soft = softened(scene)
+    if soft is scene or not displacements.any():
+        return scene
+    rows = training_rows(displacements, N_JUDGED)
+    q, loads = displacements[rows] @ modes, samples.free_forces[rows]
+    return soft if _residual(lambda: iter([(model, q)]), loads, modes) > LOCKED else scene
+
+
+def _residual(states: States, loads: Array, modes: Array) -> float:
+    """Return the median residual relative to the load; 0 if no load acts on the modes."""
     q, models = _joined(states)
     reduced = loads @ modes
     sizes = np.linalg.norm(reduced, axis=1)
@@ -76,21 +102,7 @@ def are_far(states: States, loads: Array, modes: Array) -> bool:
         for model, own, load, size in zip(models, q, reduced, sizes, strict=True)
         if size > 0
     ]
-    return bool(residuals) and float(np.median(residuals)) > FAR
-
-
-def softened_if_far(scene: Scene, samples: Snapshots, modes: Array) -> Scene:
-    """Return the scene with a softer volumetric law if projected snapshots are far, see `are_far`.
-
-    If the modes keep the volume, as those of a tube under pressure do, the scene's own law errs
-    less, and the scene is returned as it is.
-    """
-    soft = softened(scene)
-    if soft is scene:
-        return scene
-    loads = samples.free_forces[training_rows(samples.free_displacements, N_JUDGED)]
-    states = projected_states(scene, samples, modes, N_JUDGED)
-    return soft if are_far(states, loads, modes) else scene
+    return float(np.median(residuals)) if residuals else 0.0
 
 
 def equilibria(states: States, loads: Array, modes: Array) -> States:

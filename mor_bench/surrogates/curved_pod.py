@@ -25,12 +25,12 @@ from mor_bench.reduction.curved import (
     curved_system,
 )
 from mor_bench.reduction.galerkin import GalerkinProblem, stiffness_times
-from mor_bench.reduction.static_correction import SOFTENED, refuse_inverted, softened
+from mor_bench.reduction.static_correction import mark_of, marked_scene, model_of, refuse_inverted
 from mor_bench.reduction.weighted_cells import weighted_cells
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogates.cubature_states import softened_if_far
+from mor_bench.surrogates.cubature_states import softened_if_locked
 from mor_bench.surrogates.free_dofs import answer_each
 
 Array = NDArray[np.float64]
@@ -111,20 +111,18 @@ class CurvedPOD(Surrogate):
         arrays, latent = self.fit_map(scene, samples, targets @ modes, primary.shape[1])
         weights, reduced = np.ones(scene.mesh.n_cells), scene
         if self.static_correction:
-            reduced = softened_if_far(scene, samples, primary)
+            reduced = softened_if_locked(model, samples, primary)
         if self.cubature_tolerance > 0:
             curve = self.take_map(arrays, primary.shape[1], modes.shape[1])
             states = []
             for row in _spread(displacements, self.n_cubature_snapshots):
                 c, slopes = curve.at(latent[row])
                 states.append((offsets[row] + modes @ c, self.directions(slopes)))
-            system = curved_system(FullOrderModel(reduced), modes, states)
+            system = curved_system(model_of(reduced, model), modes, states)
             weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
         cells = np.flatnonzero(weights)
         secondary = np.ascontiguousarray(modes[:, primary.shape[1] :])
-        kept = {"cells": cells, "weights": weights[cells]}
-        if reduced is not scene:
-            kept[SOFTENED] = np.ones(1)
+        kept = {"cells": cells, "weights": weights[cells], **mark_of(scene, reduced)}
         return {"primary": primary, "secondary": secondary, **kept, **arrays}
 
     def prepare(self, scene: Scene, model: Arrays) -> None:
@@ -134,7 +132,7 @@ class CurvedPOD(Surrogate):
         self.space_ = np.hstack([primary, take_array(model, "secondary", (n_free, None))])
         self.cells_ = take_array(model, "cells", (None,), np.int64)
         weights = take_array(model, "weights", (len(self.cells_),))
-        reduced = softened(scene) if SOFTENED in model else scene
+        reduced = marked_scene(scene, model)
         self.curve_ = self.take_map(model, primary.shape[1], self.space_.shape[1])
         assembler, self.rows_ = weighted_cells(reduced, self.cells_, weights)
         sampled = GalerkinProblem(assembler, self.space_[self.rows_])

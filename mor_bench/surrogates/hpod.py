@@ -22,7 +22,7 @@ from mor_bench.reduction.static_correction import (
 )
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogates.cubature_states import States, softened_if_far
+from mor_bench.surrogates.cubature_states import States, softened_if_locked
 from mor_bench.surrogates.free_dofs import answer_each
 from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced_points
 
@@ -82,7 +82,9 @@ class HyperReducedPOD(CubatureSurrogate):
         return accurate_modes(snapshots, self.value("n_modes"), SOLVED / LINEAR_WEIGHT)
 
     def reduced_scene(self, scene: Scene, samples: Snapshots, modes: Array) -> Scene:
-        return softened_if_far(scene, samples, modes) if self.static_correction else scene
+        if not self.static_correction:
+            return scene
+        return softened_if_locked(FullOrderModel(scene), samples, modes)
 
     def choose_cells(
         self, states: States, modes: Array, tolerance: float

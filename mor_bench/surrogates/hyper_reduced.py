@@ -20,7 +20,7 @@ from mor_bench.reduction.basis import accurate_modes
 from mor_bench.reduction.galerkin import CubatureProblem
 from mor_bench.reduction.points import ReducedPoints
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto
-from mor_bench.reduction.static_correction import SOFTENED, softened
+from mor_bench.reduction.static_correction import mark_of, marked_scene
 from mor_bench.reduction.subspace import Subspace, extent_of
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.scene_at import scale_of
@@ -127,7 +127,7 @@ class CubatureSurrogate(Surrogate):
         tolerance = self.value("cubature_tolerance")
         modes = self.choose_modes(scene, samples)
         reduced = self.reduced_scene(scene, samples, modes)
-        kept = {"modes": modes} if reduced is scene else {"modes": modes, SOFTENED: np.ones(1)}
+        kept = {"modes": modes, **mark_of(scene, reduced)}
         if tolerance == 0:
             whole = {"cells": np.arange(scene.mesh.n_cells), "weights": np.ones(scene.mesh.n_cells)}
             return {**kept, **whole}
@@ -161,7 +161,7 @@ class CubatureSurrogate(Surrogate):
             )
         self.subspace_ = Subspace(scene, self.modes_)
         self._on_nodes = nodal(scene, self.modes_)
-        self.problem_ = self._problem(softened(scene) if SOFTENED in model else scene)
+        self.problem_ = self._problem(marked_scene(scene, model))
         self.problem_.prepare()
         if scene.contact:
             from mor_bench.reduction.pressed_modes import PressedModes  # only such scenes need it

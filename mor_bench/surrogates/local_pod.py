@@ -20,6 +20,8 @@ from mor_bench.reduction.basis import pod
 from mor_bench.reduction.static_correction import (
     SOFTENED,
     corrected_snapshots,
+    mark_of,
+    model_of,
     predict_corrected,
     softened,
 )
@@ -27,7 +29,7 @@ from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogates.cubature_states import softened_if_far
+from mor_bench.surrogates.cubature_states import softened_if_locked
 from mor_bench.surrogates.free_dofs import answer_each, galerkin_or_polynomial
 
 Array = NDArray[np.float64]
@@ -85,14 +87,13 @@ class LocalPOD(Surrogate):
         centroids, labels = _clusters(directions, self.n_clusters)
         bases = self._bases(samples.free_displacements, linear, directions, centroids, labels)
         of_clusters: dict[str, Array] = {}
-        soft = FullOrderModel(softened(scene))
         for cluster, basis in enumerate(bases):
-            own, arrays, reduced = samples[np.flatnonzero(labels == cluster)], {}, model
-            if softened_if_far(scene, own, basis) is not scene:
-                arrays, reduced = {SOFTENED: np.ones(1)}, soft
-            if polynomial_pays(reduced, basis.shape[1], len(bases)):
+            own = samples[np.flatnonzero(labels == cluster)]
+            reduced = softened_if_locked(model, own, basis)
+            arrays = mark_of(scene, reduced)
+            if polynomial_pays(model, basis.shape[1], len(bases)):
                 watched = own.free_displacements[:N_WATCHED] @ basis
-                arrays |= TensorProblem.of_modes(reduced, basis, watched).arrays
+                arrays |= TensorProblem.of_modes(model_of(reduced, model), basis, watched).arrays
             of_clusters |= {f"{name}.{cluster}": array for name, array in arrays.items()}
         return {
             **of_clusters,
@@ -136,8 +137,8 @@ class LocalPOD(Surrogate):
         self.bases_ = [
             np.ascontiguousarray(basis) for basis in np.split(modes, np.cumsum(sizes)[:-1], axis=1)
         ]
-        soft = FullOrderModel(softened(scene))
         arrays = [_of_cluster(model, cluster) for cluster in range(n_clusters)]
+        soft = model_of(softened(scene), self.model_)
         self.problems_ = [
             galerkin_or_polynomial(scene, soft if SOFTENED in own else self.model_, basis, own)
             for basis, own in zip(self.bases_, arrays, strict=True)

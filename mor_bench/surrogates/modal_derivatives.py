@@ -14,7 +14,7 @@ from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.derivative_modes import derivative_basis, patch_responses
-from mor_bench.reduction.static_correction import predict_corrected, softened
+from mor_bench.reduction.static_correction import model_of, predict_corrected, softened
 from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -57,7 +57,7 @@ class ModalDerivatives(Surrogate):
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         full = FullOrderModel(scene)
         modes = derivative_basis(scene, full, self.n_linear, self.n_modes)
-        reduced = FullOrderModel(softened(scene))
+        reduced = model_of(softened(scene), full)
         if not polynomial_pays(reduced, modes.shape[1]):
             return {"modes": modes}
         largest = (
@@ -70,7 +70,7 @@ class ModalDerivatives(Surrogate):
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
         self.modes_ = take_array(model, "modes", (len(scene.free_dofs), None))
         self.model_ = FullOrderModel(scene)
-        reduced = FullOrderModel(softened(scene))
+        reduced = model_of(softened(scene), self.model_)
         self.problem_ = galerkin_or_polynomial(scene, reduced, self.modes_, model)
         self.compliance_ = Compliance(self.model_)
         self.problem_.prepare()

@@ -20,7 +20,12 @@ from mor_bench.reduction.cubature import sparse_nnls
 from mor_bench.reduction.derivative_modes import linear_modes, modal_derivatives
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.manifold import ManifoldProblem, QuadraticManifold, manifold_system
-from mor_bench.reduction.static_correction import refuse_inverted, softened, static_correction
+from mor_bench.reduction.static_correction import (
+    model_of,
+    refuse_inverted,
+    softened,
+    static_correction,
+)
 from mor_bench.reduction.weighted_cells import weighted_cells
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -73,7 +78,7 @@ class QuadraticManifoldGalerkin(Surrogate):
         manifold = QuadraticManifold(modes, modal_derivatives(full, modes))
         weights = np.ones(scene.mesh.n_cells)
         if self.cubature_tolerance > 0:
-            reduced = FullOrderModel(softened(scene))
+            reduced = model_of(softened(scene), full)
             states = _states_under_loads(reduced, manifold)
             system = manifold_system(reduced.assembler, reduced.cell_dofs, manifold, states)
             weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
