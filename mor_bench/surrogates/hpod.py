@@ -19,6 +19,7 @@ from mor_bench.reduction.static_correction import (
     LINEAR_WEIGHT,
     corrected_snapshots,
     predict_corrected,
+    softened,
 )
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -82,7 +83,7 @@ class HyperReducedPOD(CubatureSurrogate):
         return accurate_modes(snapshots, self.value("n_modes"), SOLVED / LINEAR_WEIGHT)
 
     def reduced_scene(self, scene: Scene, samples: Snapshots, modes: Array) -> Scene:
-        if not self.static_correction:
+        if not self.static_correction or softened(scene) is scene:
             return scene
         return softened_if_locked(FullOrderModel(scene), samples, modes)
 

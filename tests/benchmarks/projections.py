@@ -163,7 +163,7 @@ def _relative(method: mor_bench.Surrogate, samples: Snapshots) -> Array:
     return errors
 
 
-def _spread(errors: Array) -> dict[str, float | None]:
+def spread_of(errors: Array) -> dict[str, float | None]:
     """Return median, 95th percentile and maximum; None for infinity."""
     figures = {
         "median": float(np.median(errors)),
@@ -191,10 +191,10 @@ def measured(contender: Contender, train: Snapshots, test: Snapshots) -> dict[st
         "n_cells": len(method.cells_) if hasattr(method, "cells_") else train.scene.mesh.n_cells,
         "n_points": getattr(getattr(points, "points", None), "n_points", None),
         "n_failed": int(np.isinf(errors).sum()),
-        "error": _spread(errors),
+        "error": spread_of(errors),
         "multiply_adds": cost.multiply_adds / len(test),
     }
-    return found if apart is None else {**found, "reconstruction": _spread(apart)}
+    return found if apart is None else {**found, "reconstruction": spread_of(apart)}
 
 
 def main(

@@ -25,6 +25,7 @@ from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.static_correction import corrected_snapshots, predict_corrected
 from mor_bench.snapshots.dataset import Dataset, Snapshots
+from tests.benchmarks.projections import TOLERANCE, spread_of
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,6 @@ SIZES = (20, 40, 80)
 """Numbers of modes."""
 LIMIT = 400
 """Samples of each body."""
-TOLERANCE = 1e-4
 
 
 def dataset_of(name: str, poisson: float) -> Dataset:
@@ -76,10 +76,8 @@ def measured(name: str, poisson: float) -> list[dict[str, Any]]:
         modes = np.ascontiguousarray(pod(snapshots, size).modes)
         for reduced in (poisson, *(ratio for ratio in REDUCED if ratio < poisson)):
             errors = errors_of(model, modes, reduced, data.test)
-            p95 = float(np.percentile(errors, 95, method="higher"))
-            spread = {"median": float(np.median(errors)), "p95": p95, "max": float(errors.max())}
             row = {"dataset": name, "poisson": poisson, "size": size, "reduced": reduced}
-            rows.append({**row, "error": spread})
+            rows.append({**row, "error": spread_of(errors)})
             print(rows[-1], flush=True)
     return rows
 
