@@ -33,8 +33,8 @@ With 10 and 20 modes, it is below 6 on beams with ν = 0.4, and above 40 with ν
 LOCKED = 1.0
 """The same residual above which modes with static correction need a softer volumetric law.
 
-With 10 to 80 modes, it is above 1.4 on a beam and a liver with ν = 0.49 and 0.499, and below 0.03
-on an artery under pressure, whose modes keep the volume.
+With 10 to 80 modes, it is above 1.4 on a beam and a liver with ν = 0.49 and 0.499. On an artery
+under pressure, three modes keep the volume, and it is below 0.03.
 """
 N_JUDGED = 100
 """Largest number of snapshots that decide about this law."""
