@@ -16,6 +16,9 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 MEMBERSHIP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 
+OPENMP_THREADS = "OMP_NUM_THREADS"
+"""Environment variable from which torch takes its number of threads when it is imported."""
+
 SIGNAL_CHECK_S = 0.2
 """Longest wait of the main thread, s.
 
@@ -42,7 +45,8 @@ def kernel_threads() -> int:
 def pinned_threads(threads: int) -> Iterator[None]:
     """Set the threads of BLAS, OpenMP, compiled kernels and, if it is loaded, torch.
 
-    Compiled kernels use more than one thread on large meshes only.
+    Compiled kernels use more than one thread on large meshes only. If torch is imported inside, it
+    starts with this number of threads, and has its usual number again afterwards.
 
     Parameters
     ----------
@@ -61,16 +65,23 @@ def pinned_threads(threads: int) -> Iterator[None]:
     """
     global _kernel_threads
     torch: Any = sys.modules.get("torch")
-    before, kernels_before = torch.get_num_threads() if torch else None, _kernel_threads
+    usual = os.environ.get(OPENMP_THREADS)
+    before = torch.get_num_threads() if torch else int(usual or usable_cores())
+    kernels_before = _kernel_threads
     with threadpool_limits(threads):
         if torch:
             torch.set_num_threads(threads)
         _kernel_threads = threads
+        os.environ[OPENMP_THREADS] = str(threads)
         try:
             yield
         finally:
             _kernel_threads = kernels_before
-            if torch:
+            if usual is None:
+                del os.environ[OPENMP_THREADS]
+            else:
+                os.environ[OPENMP_THREADS] = usual
+            if torch := sys.modules.get("torch"):
                 torch.set_num_threads(before)
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -149,6 +152,22 @@ def test_threads_are_pinned_and_then_restored() -> None:
     with pinned_threads(1):
         assert {pool["num_threads"] for pool in threadpool_info()} == {1}
     assert [pool["num_threads"] for pool in threadpool_info()] == before
+
+
+def test_torch_has_the_pinned_number_of_threads_even_if_it_is_imported_later() -> None:
+    pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
+    program = """
+import os
+from mor_bench.machine import pinned_threads, usable_cores
+with pinned_threads(1):
+    import torch
+    print(torch.get_num_threads())
+print(torch.get_num_threads() - usable_cores(), os.environ.get("OMP_NUM_THREADS"))
+"""
+    usual = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    command = [sys.executable, "-c", program]
+    said = subprocess.run(command, env=usual, check=True, capture_output=True, text=True).stdout
+    assert said.split() == ["1", "0", "None"]
 
 
 def test_the_recall_of_range_flags_matches_hand_computed_values() -> None:

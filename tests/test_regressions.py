@@ -233,6 +233,23 @@ def test_inputs_too_large_for_single_precision_still_reach_a_leaf(
     assert np.isfinite(models["pca-extra-trees"].predict(1e29 * tiny.test.forces[:2])).all()
 
 
+@pytest.mark.parametrize("name", ["pca-random-forest", "pca-extra-trees"])
+def test_the_spread_of_an_ensemble_of_trees_is_that_of_its_members(
+    models: dict[str, Any], tiny: Dataset, name: str
+) -> None:
+    forest, forces = models[name], tiny.test.forces
+    answers = []
+    for root in forest.arrays_["roots"]:
+        tree = mor_bench.load_method(name, **{**FAMILIES[name], "n_trees": 1})
+        arrays = {**forest.arrays_, "roots": np.array([root])}
+        answers.append(tree.restore(tiny.scene, arrays).predict(forces))
+    mean = np.mean(answers, axis=0)
+    away = np.sqrt(((np.array(answers) - mean) ** 2).sum(axis=(2, 3)).mean(axis=0))
+    np.testing.assert_allclose(forest.spread(forces), away / np.linalg.norm(mean, axis=(1, 2)))
+    assert forest.spread(forces).min() > 0
+    assert forest.spread(0.0 * forces[0]) == 0.0
+
+
 @pytest.mark.parametrize("order", ["generated", "imported"])
 @pytest.mark.parametrize("name", ["pca-kernel-ridge", "pca-gaussian-process"])
 def test_kernels_take_samples_from_all_load_regions(tiny: Dataset, name: str, order: str) -> None:

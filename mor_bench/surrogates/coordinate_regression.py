@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.counting import count, is_counting
 from mor_bench.errors import InvalidInputError
@@ -25,7 +25,7 @@ from mor_bench.reduction.sensitivity import sensitivities
 from mor_bench.reduction.subspace import at_wanted, wanted_dofs
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.snapshots.given import ObservedDisplacements
+from mor_bench.snapshots.given import ObservedDisplacements, checked_given
 from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.surrogate import Surrogate
 
@@ -234,6 +234,35 @@ class CoordinateRegression(Surrogate, ABC):
         gram = self._expanding @ self._expanding.T
         squared = ((coefficients @ gram) * coefficients).sum(axis=-1)
         return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+
+    def disagreement(self, forces: ArrayLike, members: Callable[[Array], Array]) -> Array:
+        """Return how much the members of an ensemble disagree, of shape () or (n,).
+
+        It is the root mean square over the members of the norm of their deviation from the mean,
+        divided by the norm of the prediction. It is infinite if a load gives a prediction of zero,
+        and zero without load. It is no bound of an error: `mor_bench.error_bound` finds the factor
+        that makes it one.
+
+        Parameters
+        ----------
+        forces : (n_nodes, 3) or (n, n_nodes, 3), or ObservedDisplacements
+            As in `predict`.
+        members : callable
+            Returns g of each member, (n_members, n, n_outputs), at inputs z (n, n_inputs).
+
+        Raises
+        ------
+        InvalidInputError, NotFittedError
+            As in `predict`.
+        """
+        predicted = np.nan_to_num(self.predict(forces))
+        given = checked_given(self.scene_, forces).values
+        found = members(self.inputs_of(given))
+        squared = (self.norms_of(found - found.mean(axis=0)) ** 2).mean(axis=0)
+        norms = np.linalg.norm(predicted.reshape(given.shape), axis=(1, 2))
+        relative = np.where(given.any(axis=(1, 2)), np.inf, 0.0)
+        np.divide(np.sqrt(squared), norms, out=relative, where=norms > 0)
+        return np.asarray(relative.reshape(np.shape(predicted)[:-2]))
 
     def _driving(self, forces: Array) -> Array:
         """Return what z is linear in, (n, n_dofs): the loads, or their response if kinked."""

@@ -26,7 +26,6 @@ from mor_bench.learning.perceptron import (
 from mor_bench.learning.training_plan import Loss
 from mor_bench.model_file import fitting_arrays, weights_to_start_from
 from mor_bench.reduction.coordinates import change_of_basis
-from mor_bench.snapshots.given import checked_given
 from mor_bench.surrogates.coordinate_regression import Array, CoordinateSamples, Input
 from mor_bench.surrogates.network_regression import NetworkRegression
 
@@ -202,34 +201,13 @@ class PODNNEnsemble(PODNN):
         return out
 
     def spread(self, forces: ArrayLike) -> Array:
-        """Return how much the members disagree, relative to the prediction, of shape () or (n,).
+        """Return how much the members disagree relative to the prediction, see `disagreement`."""
+        return self.disagreement(forces, self._members)
 
-        It is the root mean square over the members of the norm of their deviation from the mean,
-        divided by the norm of the mean. It is infinite if a load gives a prediction of zero, and
-        zero without load. It is no bound of an error: `mor_bench.error_bound` finds the factor that
-        makes it one.
-
-        Parameters
-        ----------
-        forces : (n_nodes, 3) or (n, n_nodes, 3), or ObservedDisplacements
-            As in `predict`.
-
-        Raises
-        ------
-        InvalidInputError, NotFittedError
-            As in `predict`.
-        """
-        predicted = np.nan_to_num(self.predict(forces))
-        given = checked_given(self.scene_, forces).values
-        z = self.inputs_of(given)
-        members = (self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last
-        if self._slope is not None:
-            members -= z @ self._slopes
-        squared = (self.norms_of(members - members.mean(axis=0)) ** 2).mean(axis=0)
-        norms = np.linalg.norm(predicted.reshape(given.shape), axis=(1, 2))
-        relative = np.where(given.any(axis=(1, 2)), np.inf, 0.0)
-        np.divide(np.sqrt(squared), norms, out=relative, where=norms > 0)
-        return np.asarray(relative.reshape(np.shape(predicted)[:-2]))
+    def _members(self, z: Array) -> Array:
+        """Return g of each member at z (n, n_inputs), as (n_members, n, n_outputs)."""
+        members = np.asarray((self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last)
+        return members if self._slope is None else members - z @ self._slopes
 
     def _hidden(self, z: Array) -> Array:
         """Return the last hidden layers at z (n, n_inputs), (n_members, n, n_hidden)."""

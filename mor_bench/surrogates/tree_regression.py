@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mor_bench.counting import count
@@ -115,9 +115,25 @@ class TreeRegression(CoordinateRegression):
         count(multiply_adds=len(z) * self._n_outputs)
         return self._means(z) - self._at_rest
 
+    def spread(self, forces: ArrayLike) -> Array:
+        """Return how much the trees disagree relative to the prediction, see `disagreement`."""
+        return self.disagreement(forces, self._members)
+
     def _means(self, z: Array) -> Array:
         single = np.clip(z, -1e38, 1e38).astype(np.float32)
         return np.asarray(_mean_of_leaves(*self._trees, single))
+
+    def _members(self, z: Array) -> Array:
+        """Return g of each tree at z (n, n_inputs), as (n_trees, n, n_outputs)."""
+        single = np.clip(np.vstack([z, 0.0 * z[:1]]), -1e38, 1e38).astype(np.float32)
+        features, thresholds, children, roots, values = self._trees
+        found: Array = np.stack(
+            [
+                _mean_of_leaves(features, thresholds, children, root, values, single)
+                for root in roots[:, None]
+            ]
+        )
+        return found[:, :-1] - found[:, -1:]
 
 
 @dataclass(eq=False)

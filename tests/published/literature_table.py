@@ -1,4 +1,4 @@
-"""The table of numbers from the literature beside ours, on the nearest set-up that was measured."""
+"""Tables of numbers from the literature beside ours, on the nearest set-up that was measured."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from tests.published.stored import EvidenceError, content_of, number_of
 
 
 def literature(source: str) -> str:
-    """Show each number of a TOML file beside ours, their ratio, and the experiment behind ours.
+    """Show each number of a TOML file beside ours, and their ratio, in a table per family.
+
+    The last column is the command that repeats ours.
 
     An entry has the `family`, `what` is measured, the `published` number with its `unit` and
     `source`, the `nearest` set-up of ours, and a number `ours` as in claims.toml. Its file belongs
@@ -21,7 +23,7 @@ def literature(source: str) -> str:
     EvidenceError
         If an experiment is unknown, or does not write the file of our number.
     """
-    body = []
+    families: dict[str, list[list[str]]] = {}
     for entry in content_of(source)["number"]:
         name, file = entry["experiment"], entry["ours"]["file"]
         if name not in experiments() or not file.startswith(f"reports/{name}"):
@@ -31,16 +33,20 @@ def literature(source: str) -> str:
             largest = number_of(entry["largest"])
             amplitudes = f"{number(entry['published_largest_m'])} / {number(largest)}"
             ours /= largest if entry.get("relative") else 1.0
-        body.append(
+        families.setdefault(entry["family"], []).append(
             [
-                entry["family"],
                 f"{entry['what']} ({entry['unit']})",
                 f"{number(entry['published'])}: {entry['source']}",
                 f"{number(ours)}: {entry['nearest']}",
                 number(ours / entry["published"]),
                 amplitudes,
-                f"`{name}`",
+                f"`python -m tests.published.record {name}`",
             ]
         )
-    headings = ["family", "quantity", "published", "ours", "ours / published"]
-    return markdown([*headings, "largest u, m: published / ours", "experiment"], body)
+    headings = ["quantity", "published", "ours", "ours / published"]
+    headings += ["largest u, m: published / ours", "command"]
+    tables = (
+        f"**{name[0].upper()}{name[1:]}**\n\n{markdown(headings, body)}"
+        for name, body in families.items()
+    )
+    return "\n\n".join(tables)

@@ -32,7 +32,12 @@ from tests.published.network_size_tables import (
     paper_size_latency,
     training_speed,
 )
-from tests.published.projection_tables import projections, reconstructions, softened_volume
+from tests.published.projection_tables import (
+    projections,
+    reconstructions,
+    response_inputs,
+    softened_volume,
+)
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.sampling_tables import learning_curves
@@ -392,6 +397,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "projections": projections,
     "reconstructions": reconstructions,
     "softened-volume": softened_volume,
+    "response-inputs": response_inputs,
     "learning-curves": learning_curves,
     "training-iterations": training_iterations,
     "training-samples": training_samples,

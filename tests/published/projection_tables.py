@@ -60,6 +60,19 @@ def softened_volume(source: str, size: str) -> str:
     return markdown(headings, body)
 
 
+def response_inputs(source: str, dataset: str) -> str:
+    """Show errors of regressions by what they start from, and the time of the start."""
+    rows = [row for row in content_of(source)["rows"] if row["dataset"] == dataset]
+    learned = [name for name in rows[0] if name.startswith("pca-")]
+    headings = ["start", "ms of the start", "alone: median / p95 / max, %"]
+    headings += [f"with `{name}`: median / p95 / max, %" for name in learned]
+    body = []
+    for row in rows:
+        spreads = (" / ".join(_percents(row[name])) for name in ("alone", *learned))
+        body.append([row["start"], number(row["start_ms"]), *spreads])
+    return markdown(headings, body)
+
+
 def _percents(spread: Mapping[str, float | None]) -> list[str]:
     found = (spread[name] for name in ("median", "p95", "max"))
     return ["∞" if value is None else number(100 * value) for value in found]
