@@ -45,8 +45,9 @@ def kernel_threads() -> int:
 def pinned_threads(threads: int) -> Iterator[None]:
     """Set the threads of BLAS, OpenMP, compiled kernels and, if it is loaded, torch.
 
-    Compiled kernels use more than one thread on large meshes only. If torch is imported inside, it
-    starts with this number of threads, and has its usual number again afterwards.
+    Compiled kernels use more than one thread on large meshes only. Libraries that are loaded inside
+    start with this number. Afterwards torch has that of OMP_NUM_THREADS again, or all usable cores;
+    other libraries that were loaded inside keep it.
 
     Parameters
     ----------
@@ -66,7 +67,7 @@ def pinned_threads(threads: int) -> Iterator[None]:
     global _kernel_threads
     torch: Any = sys.modules.get("torch")
     usual = os.environ.get(OPENMP_THREADS)
-    before = torch.get_num_threads() if torch else int(usual or usable_cores())
+    before = torch.get_num_threads() if torch else _openmp_threads(usual or "")
     kernels_before = _kernel_threads
     with threadpool_limits(threads):
         if torch:
@@ -78,11 +79,17 @@ def pinned_threads(threads: int) -> Iterator[None]:
         finally:
             _kernel_threads = kernels_before
             if usual is None:
-                del os.environ[OPENMP_THREADS]
+                os.environ.pop(OPENMP_THREADS, None)
             else:
                 os.environ[OPENMP_THREADS] = usual
             if torch := sys.modules.get("torch"):
                 torch.set_num_threads(before)
+
+
+def _openmp_threads(said: str) -> int:
+    """Return the first number of a list such as "4,2", or the number of usable cores."""
+    first = said.split(",")[0].strip()
+    return int(first) if first.isdecimal() and int(first) > 0 else usable_cores()
 
 
 @cache

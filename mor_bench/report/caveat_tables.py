@@ -120,7 +120,8 @@ def error_bounds(entries: Sequence[Entry]) -> TextTable | None:
         "regions as groups. Other columns: the share of each "
         "test set within the bound (%)."
     )
-    if any(e.row.bound.scaled for e in bounded if e.row.bound):
+    scales = [e.row.bound.scaled for e in bounded if e.row.bound]
+    if any(scaled and scaled.widths for scaled in scales):
         note += (
             " × spread: every load has a bound of its own, proportional to the disagreement of "
             "the ensemble. Its median over the test set stands in parentheses (%)."

@@ -201,7 +201,10 @@ class PODNNEnsemble(PODNN):
         return out
 
     def spread(self, forces: ArrayLike) -> Array:
-        """Return how much the members disagree relative to the prediction, see `disagreement`."""
+        """Return how much the members disagree relative to the prediction, of shape () or (n,).
+
+        Parameters and errors are those of `disagreement`.
+        """
         return self.disagreement(forces, self._members)
 
     def _members(self, z: Array) -> Array:

@@ -116,7 +116,10 @@ class TreeRegression(CoordinateRegression):
         return self._means(z) - self._at_rest
 
     def spread(self, forces: ArrayLike) -> Array:
-        """Return how much the trees disagree relative to the prediction, see `disagreement`."""
+        """Return how much the trees disagree relative to the prediction, of shape () or (n,).
+
+        Parameters and errors are those of `disagreement`. It is zero for a single tree.
+        """
         return self.disagreement(forces, self._members)
 
     def _means(self, z: Array) -> Array:

@@ -65,7 +65,7 @@ def bent(body: Body, load: Array) -> Array:
 def second_order(body: Body, load: Array) -> Array:
     """Return u + K₀⁻¹(f - f_int(u)) at the linear response u.
 
-    Up to third order in the load, this is the response with the modal derivative along u itself.
+    Up to terms of third order in the load, this is the response with the modal derivative along u.
     """
     u = linear(body, load)
     return u + body.model.rest_factor.solve(load - body.model.force(u).force)

@@ -13,6 +13,7 @@ from mor_bench.measure.mesh_limit import known_error
 from mor_bench.report.number_format import DASH, number
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import load_method_spec
+from tests.published import projection_tables
 from tests.published.choice_tables import choices, choices_decided
 from tests.published.cost_tables import (
     generation,
@@ -31,12 +32,6 @@ from tests.published.network_size_tables import (
     paper_size,
     paper_size_latency,
     training_speed,
-)
-from tests.published.projection_tables import (
-    projections,
-    reconstructions,
-    response_inputs,
-    softened_volume,
 )
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
@@ -394,10 +389,10 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "evidence": evidence,
     "literature": literature,
     "timed-work": timed_work,
-    "projections": projections,
-    "reconstructions": reconstructions,
-    "softened-volume": softened_volume,
-    "response-inputs": response_inputs,
+    "projections": projection_tables.projections,
+    "reconstructions": projection_tables.reconstructions,
+    "softened-volume": projection_tables.softened_volume,
+    "response-inputs": projection_tables.response_inputs,
     "learning-curves": learning_curves,
     "training-iterations": training_iterations,
     "training-samples": training_samples,
