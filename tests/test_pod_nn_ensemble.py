@@ -106,3 +106,9 @@ def test_a_run_reports_the_scaled_bound(tmp_path: Path, cache: Path) -> None:
     table = error_bounds(entries_of(found, "beam-tiny"))
     assert table is not None
     assert [row[0] for row in table.rows] == ["linear-fem", "ensemble", "ensemble × spread"]
+    assert "× spread" in table.note
+    scaled.widths.clear()  # as if the bound were infinite
+    table = error_bounds(entries_of(found, "beam-tiny"))
+    assert table is not None
+    assert [row[0] for row in table.rows] == ["linear-fem", "ensemble"]
+    assert "× spread" not in table.note

@@ -30,6 +30,9 @@ from mor_bench.surrogates.curved_pod import CurvedPOD
 
 Array = NDArray[np.float64]
 Parameters = dict[str, Any]
+ErrorsFile = Annotated[
+    Path | None, typer.Option("--json", metavar="FILE", help="Write the errors here.")
+]
 
 LAWS = ("beam-neo-hooke", "beam-mooney-rivlin", "beam-nearly-incompressible", "beam-tet")
 """Scenes of `hyper`: a law or element each."""
@@ -171,6 +174,12 @@ def spread_of(errors: Array) -> dict[str, float | None]:
         "max": float(errors.max()),
     }
     return {name: value if np.isfinite(value) else None for name, value in figures.items()}
+
+
+def write_rows(report: Path | None, rows: list[dict[str, Any]]) -> None:
+    """Write rows to a JSON file, if one is given."""
+    if report is not None:
+        report.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
 
 
 def measured(contender: Contender, train: Snapshots, test: Snapshots) -> dict[str, Any]:

@@ -8,13 +8,11 @@ linear response comes from stored columns of K₀⁻¹; the others add back-solv
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import typer
@@ -28,7 +26,7 @@ from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import error_weights, input_axes
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
-from tests.benchmarks.projections import spread_of
+from tests.benchmarks.projections import ErrorsFile, spread_of, write_rows
 
 Array = NDArray[np.float64]
 
@@ -140,16 +138,11 @@ def measured(scene: str) -> list[dict[str, Any]]:
     return rows
 
 
-def main(
-    report: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the errors here.")
-    ] = None,
-) -> None:
+def main(report: ErrorsFile = None) -> None:
     """Compare starts of regressions on the linear response."""
     with pinned_threads(1):
         rows = [row for scene in SCENES for row in measured(scene)]
-    if report is not None:
-        report.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    write_rows(report, rows)
 
 
 if __name__ == "__main__":

@@ -9,10 +9,8 @@ those of modes and law alone.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import typer
@@ -25,7 +23,7 @@ from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.static_correction import corrected_snapshots, predict_corrected
 from mor_bench.snapshots.dataset import Dataset, Snapshots
-from tests.benchmarks.projections import TOLERANCE, spread_of
+from tests.benchmarks.projections import TOLERANCE, ErrorsFile, spread_of, write_rows
 
 Array = NDArray[np.float64]
 
@@ -82,15 +80,10 @@ def measured(name: str, poisson: float) -> list[dict[str, Any]]:
     return rows
 
 
-def main(
-    report: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the errors here.")
-    ] = None,
-) -> None:
+def main(report: ErrorsFile = None) -> None:
     """Compare Poisson's ratios of reduced problems with static correction."""
     rows = [row for name in SCENES for poisson in BODIES for row in measured(name, poisson)]
-    if report is not None:
-        report.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    write_rows(report, rows)
 
 
 if __name__ == "__main__":
