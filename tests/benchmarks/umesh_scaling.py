@@ -4,7 +4,8 @@
 
 The dataset has the paper's deformation, and the split is the paper's: at random. Every number of
 iterations is a training of its own, with its own learning-rate schedule. Rows that the file has
-already are not trained again, so that the same command continues after an interruption.
+already are not trained again, and a training writes a checkpoint beside the file, so that the same
+command continues after an interruption.
 """
 
 from __future__ import annotations
@@ -26,13 +27,23 @@ import mor_bench
 from mor_bench.machine import pinned_threads
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.store import write_atomically
+from mor_bench.training_options import TrainingOptions
 from tests.benchmarks.choices import scored
 
 ITERATIONS = (780, 1560, 3125, 6250, 12_500)
 """With batches of 32, the last number shows as many samples as the paper's 100,000 batches of 4."""
 
-SIZES = ((4, 2, 12_500), (8, 2, 12_500), (16, 2, 12_500), (32, 2, 6250), (8, 3, 3125))
-"""Channels, steps, and the largest number of iterations."""
+Size = tuple[int, int, int]
+"""Channels, steps, and number of iterations."""
+
+SIZES: tuple[Size, ...] = (
+    (4, 2, 12_500),
+    (8, 2, 12_500),
+    (16, 2, 12_500),
+    (32, 2, 6250),
+    (8, 3, 3125),
+)
+"""Sizes with the largest number of iterations."""
 
 BATCH = 32
 """Samples of a batch, in the file of the method."""
@@ -160,15 +171,21 @@ def fit_law(
     return Law(found, inverse, float(np.sqrt(squares / (len(rows) - len(found)))), len(rows))
 
 
-def trained(data: Dataset, channels: int, steps: int, iterations: int) -> dict[str, Any]:
-    """Train one network, and score it."""
+def trained(data: Dataset, size: Size, checkpoint: Path) -> dict[str, Any]:
+    """Train one network from its checkpoint if there is one, and score it.
+
+    The core-seconds are those since the checkpoint.
+    """
+    channels, steps, iterations = size
     method = mor_bench.load_method(
         "umesh-small", channels=channels, steps=steps, iterations=iterations
     )
+    method.training = TrainingOptions(checkpoint=checkpoint)
     with pinned_threads(1):
         begun = process_time()
         method.fit(data.scene, data.train)
         core_s = process_time() - begun
+        checkpoint.unlink()
         return {
             "channels": channels,
             "steps": steps,
@@ -185,6 +202,10 @@ def main(
         Path,
         typer.Option("--json", metavar="FILE", help="Write errors here, and keep its rows."),
     ] = Path("umesh-scaling.json"),
+    only: Annotated[
+        tuple[int, int, int] | None,
+        typer.Option(help="Train one size: channels, steps, iterations."),
+    ] = None,
 ) -> None:
     """Train U-Meshes of several sizes for several numbers of iterations."""
     data = mor_bench.load_dataset(dataset, split="sample")
@@ -199,8 +220,9 @@ def main(
         rows = json.loads(report.read_text(encoding="utf-8"))["rows"]
     known = {(row["channels"], row["steps"], row["iterations"]) for row in rows}
     wanted = [(c, k, n) for c, k, most in SIZES for n in ITERATIONS if n <= most]
+    wanted = wanted if only is None else [only]
     for size in sorted(set(wanted) - known, key=lambda s: (s[0] * s[2], s)):
-        rows.append(trained(data, *size))
+        rows.append(trained(data, size, report.with_suffix(".checkpoint")))
         print(f"{size}: {rows[-1]['test']['mean_dof_m']:.3g} m", flush=True)
         write_atomically(report, (json.dumps({**setting, "rows": rows}, indent=1) + "\n").encode())
 
