@@ -107,6 +107,36 @@ def test_the_networks_of_torch_and_numpy_have_equal_values_and_derivatives() -> 
         np.testing.assert_allclose(slopes[:, k], difference / 2e-5, atol=1e-7)
     difference = evaluate(weights, 1e-5 * np.eye(3)) - evaluate(weights, -1e-5 * np.eye(3))
     np.testing.assert_allclose(slope_at_rest(weights), difference / 2e-5, atol=1e-7)
+    value, slope = (found.detach().numpy() for found in network.at_rest())
+    np.testing.assert_allclose(value, evaluate(weights, 0.0 * x[0]), atol=1e-12)
+    np.testing.assert_allclose(slope, slope_at_rest(weights), atol=1e-12)
+
+
+@pytest.mark.parametrize("n_inputs", [1, 3])
+def test_stacked_networks_have_the_values_and_derivatives_of_their_members(n_inputs: int) -> None:
+    from mor_bench.learning.perceptron import Perceptron, stacked
+
+    drawn = torch.Generator().manual_seed(0)
+    members = [Perceptron(n_inputs, 8, 2, drawn) for _ in range(3)]
+    for member in members:
+        for bias in (member.weights[1], member.weights[3]):
+            torch.nn.init.normal_(bias, generator=drawn)
+    together = stacked(members)
+    for kept, member in zip(together.members(), members, strict=True):
+        for found, expected in zip(kept, member.arrays(), strict=True):
+            np.testing.assert_array_equal(found, expected)
+    x = torch.randn(5, n_inputs, generator=drawn)
+    directions = torch.randn(5, 4, n_inputs, generator=drawn)
+    torch.testing.assert_close(together(x), torch.stack([member(x) for member in members]))
+    for of_all, *of_each in zip(
+        together.with_derivatives(x, directions),
+        *(member.with_derivatives(x, directions) for member in members),
+        strict=True,
+    ):
+        torch.testing.assert_close(of_all, torch.stack(of_each))
+    value, slope = together.at_rest()
+    torch.testing.assert_close(value[:, 0], torch.stack([m.at_rest()[0] for m in members]))
+    torch.testing.assert_close(slope, torch.stack([m.at_rest()[1] for m in members]))
 
 
 @pytest.mark.parametrize("derivatives", [False, True])

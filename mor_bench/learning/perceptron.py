@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +21,7 @@ class Perceptron(nn.Module):
 
     Both hidden layers have the same width, and the last layer has no bias. The initial weights have
     the variance 1 / inputs and are drawn in the order of the parameters. The biases are zero.
+    `stacked` joins networks of one size, which are then evaluated together.
     """
 
     def __init__(
@@ -49,16 +51,32 @@ class Perceptron(nn.Module):
 
         Returns
         -------
-        values : (n, n_outputs)
-        derivatives : (n, d, n_outputs)
+        values : (..., n, n_outputs)
+        derivatives : (..., n, d, n_outputs)
         """
         first, first_bias, second, second_bias, last = self.weights
+        n, d = directions.shape[:2]
+        directions = directions.flatten(0, 1)
         for weight, bias in ((first, first_bias), (second, second_bias)):
-            x = x @ weight + bias
-            share = torch.sigmoid(x)
-            directions = (directions @ weight) * (share * (1.0 + x * (1.0 - share)))[:, None]
-            x = x * share
-        return x @ last, directions @ last
+            x, slope = _silu_with_slope(x @ weight + bias)
+            changed = directions @ weight
+            directions = changed * slope.repeat_interleave(d, dim=-2)
+        values, changed = x @ last, directions @ last
+        return values, changed.view(*changed.shape[:-2], n, d, -1)
+
+    def at_rest(self) -> tuple[Tensor, Tensor]:
+        """Return the value and the slope at x = 0.
+
+        Returns
+        -------
+        value : (n_outputs,), or (..., 1, n_outputs) if stacked
+        slope : (..., n_inputs, n_outputs)
+        """
+        first, first_bias, second, second_bias, last = self.weights
+        x, share = _silu_with_slope(first_bias)
+        slope = first * share
+        x, share = _silu_with_slope(x @ second + second_bias)
+        return x @ last, (slope @ second * share) @ last
 
     def take(self, arrays: Sequence[Array]) -> None:
         """Replace the weights."""
@@ -69,6 +87,36 @@ class Perceptron(nn.Module):
     def arrays(self) -> list[Array]:
         """Return weights and biases from input to output, float64."""
         return [weight.detach().cpu().numpy().astype(np.float64) for weight in self.weights]
+
+    def members(self) -> list[list[Array]]:
+        """Return the arrays of each network of a stack, or of this one."""
+        weights = self.arrays()
+        if weights[0].ndim == 2:
+            return [weights]
+        parts = zip(NAMES, weights, strict=True)
+        weights = [part[:, 0] if name.endswith("bias") else part for name, part in parts]
+        return [list(of_member) for of_member in zip(*weights, strict=True)]
+
+
+def stacked(members: Sequence[Perceptron]) -> Perceptron:
+    """Return one module of several networks of one size; its answers have a leading axis.
+
+    One network alone is returned as it is.
+    """
+    if len(members) == 1:
+        return members[0]
+    together = deepcopy(members[0])
+    together.weights = nn.ParameterList(
+        torch.stack(parts).unsqueeze(1) if parts[0].ndim == 1 else torch.stack(parts)
+        for parts in zip(*(member.weights for member in members), strict=True)
+    )
+    return together
+
+
+def _silu_with_slope(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return s(x) and s′(x)."""
+    share = torch.sigmoid(x)
+    return x * share, share * (1.0 + x * (1.0 - share))
 
 
 def evaluate(weights: Sequence[Array], x: Array) -> Array:

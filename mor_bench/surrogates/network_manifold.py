@@ -93,12 +93,13 @@ class NetworkManifold(CurvedPOD):
             z = x[rows, :r]
             if self.encodes:
                 z = z + networks[1](x[rows]) - networks[1](nothing)
-            slope: Tensor | float = 0.0
-            rest = nothing[:, :r]
-            at_rest = decoder(rest)
+            found = decoder(z)
             if self.static_correction:
-                slope = decoder.with_derivatives(rest, z[None])[1][0]
-            missing = wanted[rows, first:] - (decoder(z) - at_rest - slope)
+                at_rest, slope = decoder.at_rest()
+                found = found - z @ slope
+            else:
+                at_rest = decoder(nothing[:, :r])
+            missing = wanted[rows, first:] - (found - at_rest)
             if first == 0:
                 missing = missing - nn.functional.pad(z * linear, (0, wanted.shape[1] - r))
             mean: Tensor = ((missing * weights[rows]) ** 2).sum(dim=1).mean()

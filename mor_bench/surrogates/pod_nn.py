@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
 from mor_bench.counting import count
 from mor_bench.learning.perceptron import (
@@ -21,6 +21,7 @@ from mor_bench.learning.perceptron import (
     named_shapes,
     silu,
     slope_at_rest,
+    stacked,
     taken,
 )
 from mor_bench.learning.training_plan import Loss
@@ -94,16 +95,9 @@ class PODNN(NetworkRegression):
         if self.training.start_from is not None:
             for name, member in members.items():
                 member.take(self._weights_of(self.training.start_from, name, scale))
-        networks = nn.ModuleList(members.values()).to(data["inputs"].device)
-        losses = [self._loss(member, data) for member in members.values()]
-
-        def loss(rows: Tensor) -> Tensor:
-            """Return the sum; Adam steps each weight alone, so every member takes its own step."""
-            return torch.stack([of_member(rows) for of_member in losses]).sum()
-
-        known = self.train(networks, loss, data, generator)
-        for name, member in members.items():
-            weights = member.arrays()
+        together = stacked(list(members.values())).to(data["inputs"].device)
+        known = self.train(together, self._loss(together, data), data, generator)
+        for name, weights in zip(members, together.members(), strict=True):
             weights[-1] *= scale
             known |= named(name, weights)
         return known
@@ -121,27 +115,37 @@ class PODNN(NetworkRegression):
             last @ change_of_basis(modes, self.modes_).T / scale,
         ]
 
-    def _loss(self, network: Perceptron, data: dict[str, Tensor]) -> Loss:
+    def _loss(self, networks: Perceptron, data: dict[str, Tensor]) -> Loss:
         z, wanted, weights = data["inputs"], data["outputs"], data["weights"]
         known, rest = data.get("directions"), torch.zeros_like(z[:1])
 
-        def loss(rows: Tensor) -> Tensor:
-            directions = z[rows, None]
-            if known is not None:
-                directions = torch.cat([directions, known[rows]], dim=1)
-            found, slopes = network.with_derivatives(z[rows], directions[:, 1:])
-            if self.input == "linear-response":
-                at_rest, first = network.with_derivatives(rest, directions.flatten(0, 1)[None])
-                first = first.reshape(*directions.shape[:2], -1)
-                found, slopes = found - first[:, 0], slopes - first[:, 1:]
+        def remainder(x: Tensor) -> Tensor:
+            found: Tensor = networks(x)
+            if self.input == "force":
+                found = found - networks(rest)
             else:
-                at_rest = network(rest)
-            weight = weights[rows]
-            total = (((found - at_rest - wanted[rows]) * weight) ** 2).sum(dim=1).mean()
-            if known is not None:
-                wrong = (slopes - data["slopes"][rows]) * weight[:, None]
-                total = total + DERIVATIVE_WEIGHT * (wrong**2).sum(dim=(1, 2)).mean()
-            return total
+                value, slope = networks.at_rest()
+                found = found - value - x @ slope
+            return found
+
+        def derivatives(x: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+            """Return the remainder, and its derivatives with respect to the load."""
+            value, slope = networks.at_rest()
+            found, slopes = networks.with_derivatives(x, directions)
+            if self.input == "force":
+                return found - value, slopes
+            linear = directions.flatten(0, 1) @ slope
+            return found - value - x @ slope, slopes - linear.view_as(slopes)
+
+        def loss(rows: Tensor) -> Tensor:
+            """Return the sum over the networks; Adam steps each weight alone."""
+            x, weight = z[rows], weights[rows]
+            if known is None:
+                return ((remainder(x) - wanted[rows]) * weight).square().sum() / len(rows)
+            found, slopes = derivatives(x, known[rows])
+            values = ((found - wanted[rows]) * weight).square().sum()
+            wrong = (slopes - data["slopes"][rows]) * weight[:, None]
+            return (values + DERIVATIVE_WEIGHT * wrong.square().sum()) / len(rows)
 
         return loss
 
