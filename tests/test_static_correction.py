@@ -16,9 +16,12 @@ from mor_bench.reduction.static_correction import MOST_POISSON, SOFTENED, soften
 from mor_bench.scene.materials import NeoHookean
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.cubature_states import softened_if_locked
+from mor_bench.surrogates.deim import InterpolatedPOD
+from mor_bench.surrogates.ecm import EmpiricalCubaturePOD
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.linear_fem import LinearFEM
 from mor_bench.surrogates.local_pod import LocalPOD
+from mor_bench.surrogates.pod import PODGalerkin
 from tests.verification.laws_and_elements import LAWS
 from tests.verification.scenes import scene_of, solved
 
@@ -37,18 +40,32 @@ def test_static_correction_over_all_cells_is_that_of_a_single_local_basis(
     corrected = HyperReducedPOD(5, 0.0, static_correction=True).fit(scene, train)
     size = np.abs(local).max()
     assert np.abs(corrected.predict(train.forces) - local).max() <= 1e-9 * size
-    few = HyperReducedPOD(5, 1e-2, static_correction=True).fit(scene, train)
-    assert len(few.cells_) < scene.mesh.n_cells
-    assert np.abs(few.predict(train.forces) - local).max() <= 0.03 * size
     small = 1e-6 * train.forces
     linear = LinearFEM().fit(scene, None).predict(small)
-    assert np.abs(few.predict(small) - linear).max() <= 1e-5 * np.abs(linear).max()
+    for few in (
+        HyperReducedPOD(5, 1e-2, static_correction=True),
+        EmpiricalCubaturePOD(5, 1e-2, static_correction=True),
+        *(
+            InterpolatedPOD(5, 10, sampling=sampling, static_correction=True)
+            for sampling in ("dofs", "cell-dofs", "cells")
+        ),
+    ):
+        few.fit(scene, train)
+        assert len(few.cells_) < scene.mesh.n_cells
+        assert np.abs(few.predict(train.forces) - local).max() <= 0.03 * size
+        assert np.abs(few.predict(small) - linear).max() <= 1e-5 * np.abs(linear).max()
+    pod, plain = PODGalerkin(5).fit(scene, train), InterpolatedPOD(5, 10).fit(scene, train)
+    expected = pod.predict(small)
+    assert np.abs(plain.predict(small) - expected).max() <= 1e-5 * np.abs(expected).max()
 
 
 def test_static_correction_needs_a_body_without_contact_and_sampled_parameters() -> None:
-    method = HyperReducedPOD(5, static_correction=True)
-    for name in ("liver-pressed", "beam-stiffness"):
-        assert "static correction" in str(method.supports(mor_bench.load_scene(name)))
+    for method in (
+        HyperReducedPOD(5, static_correction=True),
+        EmpiricalCubaturePOD(5, static_correction=True),
+    ):
+        for name in ("liver-pressed", "beam-stiffness"):
+            assert "static correction" in str(method.supports(mor_bench.load_scene(name)))
 
 
 @pytest.mark.parametrize(
@@ -58,6 +75,8 @@ def test_static_correction_needs_a_body_without_contact_and_sampled_parameters()
         ("quadratic-manifold", {"n_modes": 4}),
         ("local-pod", {"n_clusters": 2, "n_modes": 4}),
         ("hpod", {"n_modes": 4, "static_correction": True}),
+        ("ecm", {"n_modes": 4, "static_correction": True}),
+        ("deim", {"n_modes": 4, "static_correction": True}),
     ],
 )
 def test_a_body_that_the_static_correction_inverts_is_refused(
@@ -150,6 +169,8 @@ RESTING = {
         ("hpod", HPOD, {}),
         ("hpod", HPOD, {"material": NEARER}),
         ("hpod", HPOD, RESTING),
+        ("ecm", HPOD, {}),
+        ("deim", HPOD | {"sampling": "cells", "n_force_modes": 80}, {}),
         ("local-pod", {"n_clusters": 1, "n_modes": 20}, {}),
         ("local-pod", {"n_clusters": 2, "n_modes": 10}, {"material": POLYNOMIAL}),
         ("quadratic-manifold-pod", {"n_latent": 20}, {}),

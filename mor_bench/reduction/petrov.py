@@ -23,6 +23,7 @@ from mor_bench.mechanics.newton import (
     NewtonOptions,
 )
 from mor_bench.mechanics.problem import LINEAR, is_round_off
+from mor_bench.reduction.galerkin import dense_factor
 from mor_bench.reduction.points import ReducedPoints
 
 Array = NDArray[np.float64]
@@ -47,7 +48,7 @@ class InterpolatedProblem:
 
     Raises
     ------
-    numpy.linalg.LinAlgError
+    NotPositiveDefiniteError
         If ``rest`` is not positive definite.
     """
 
@@ -55,7 +56,7 @@ class InterpolatedProblem:
         self.points, self.extent = points, extent
         with uncounted():
             self._linear = rest - points.force_and_tangent(np.zeros(len(rest)))[1]
-        np.linalg.cholesky(rest)
+            self.rest_factor = dense_factor(rest)
         self._rest = rest
 
     def linearise(self, q: Array) -> tuple[Array, Array, float]:
@@ -122,12 +123,13 @@ class InterpolatedProblem:
         q, size, load_norm = start, np.inf, float(np.linalg.norm(load))
         force, tangent, min_det = self.linearise(q)
         for iteration in range(1, PLAIN_ITERATIONS + 1):
-            residual = load - force
+            residual, before = load - force, size
             size = float(np.linalg.norm(residual))
             if not size <= HOPELESS * load_norm:
                 return None, min_det, iteration
             step, positive = _factored(tangent, residual)
-            small = np.isfinite(step).all() and is_round_off(step, q)
+            floor = self.extent if size > 0.5 * before else 0.0
+            small = np.isfinite(step).all() and is_round_off(step, q, floor)
             if size <= tolerance * load_norm or small:
                 return (q if positive and min_det > 0 else None), min_det, iteration
             for halving in range(MAX_HALVINGS if damped else 1):

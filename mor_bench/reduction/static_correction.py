@@ -26,6 +26,7 @@ from mor_bench.mechanics.locking import locking_risk
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem
+from mor_bench.reduction.petrov import InterpolatedProblem
 from mor_bench.reduction.tensors import TensorProblem
 from mor_bench.scene.scene import Scene
 
@@ -116,7 +117,7 @@ def static_correction(
 
 
 def predict_corrected(
-    problem: GalerkinProblem | CubatureProblem | TensorProblem,
+    problem: GalerkinProblem | CubatureProblem | TensorProblem | InterpolatedProblem,
     modes: NDArray[np.float64],
     model: FullOrderModel,
     rest_factor: Factor,
@@ -133,6 +134,8 @@ def predict_corrected(
     reduced = project(modes, load[None])[0]
     if isinstance(problem, TensorProblem):
         q = problem.solve(reduced, tolerance)
+    elif isinstance(problem, InterpolatedProblem):
+        q = problem.solve(reduced, NewtonOptions(tolerance))
     else:
         q = problem.solve(reduced, NewtonOptions(tolerance)).displacement
     u = rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench.errors import InvalidInputError
+from mor_bench.mechanics.linear import NotPositiveDefiniteError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.model_arrays import take_array, take_indices
@@ -19,11 +20,13 @@ from mor_bench.reduction.discrete_interpolation import Selection, interpolation_
 from mor_bench.reduction.galerkin import stiffness_times
 from mor_bench.reduction.petrov import InterpolatedProblem
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto
+from mor_bench.reduction.static_correction import mark_of, marked_scene
 from mor_bench.reduction.subspace import Subspace, extent_of
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.corrected import Correction, corrected_modes, corrected_scene
 from mor_bench.surrogates.cubature_states import (
     are_far,
     equilibria,
@@ -78,6 +81,8 @@ class InterpolatedPOD(Surrogate):
         Training snapshots whose forces span U, spread evenly over the training set.
     tolerance : float or "auto"
         Norm of the reduced residual relative to that of the reduced load, in (0, 1].
+    static_correction : bool
+        As in `CubatureSurrogate`.
     """
 
     n_modes: Annotated[int, Field(ge=1)] | Auto = 20
@@ -87,6 +92,7 @@ class InterpolatedPOD(Surrogate):
     tolerance: Annotated[float, Field(gt=0, le=1)] | Auto = 1e-8
     sampling: Literal["dofs", "cell-dofs", "cells"] = "dofs"
     states: Literal["projected", "equilibria", "as-needed"] = "as-needed"
+    static_correction: bool = False
 
     sized: ClassVar = {"n_modes": MODES, "n_force_modes": FORCE_MODES, "tolerance": TOLERANCES}
 
@@ -94,23 +100,23 @@ class InterpolatedPOD(Surrogate):
         return unknown_equations(scene)
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
-        displacements = samples.free_displacements
-        modes = accurate_modes(displacements, self.value("n_modes"))
-        model = FullOrderModel(scene)
+        if self.static_correction:
+            modes = corrected_modes(scene, samples, self.value("n_modes"))
+            reduced = corrected_scene(scene, samples, modes)
+        else:
+            modes = accurate_modes(samples.free_displacements, self.value("n_modes"))
+            reduced = scene
+        model = FullOrderModel(reduced)
         stiff = stiffness_times(model.assembler.pattern, model.rest_tangent, modes)
-        q = self._coordinates(scene, samples, modes)
-        rest = modes.T @ stiff
+        q = self._coordinates(reduced, samples, modes)
+        kept = {"modes": modes, "rest": modes.T @ stiff, **mark_of(scene, reduced)}
         if self.sampling != "dofs":
-            return {"modes": modes, "rest": rest, **self._unassembled(model, modes, q)}
+            return {**kept, **self._unassembled(model, modes, q)}
         forces = np.array([model.force(modes @ own).force - stiff @ own for own in q])
         basis = pod(forces, self.value("n_force_modes")).modes
         dofs = interpolation_rows(basis, self.selection)
-        return {
-            "modes": modes,
-            "dofs": dofs,
-            "interpolation": np.linalg.solve(basis[dofs].T, basis.T @ modes),
-            "rest": rest,
-        }
+        interpolation = np.linalg.solve(basis[dofs].T, basis.T @ modes)
+        return {**kept, "dofs": dofs, "interpolation": interpolation}
 
     def _coordinates(self, scene: Scene, samples: Snapshots, modes: Array) -> Array:
         """Return coordinates (n, r) of the training states."""
@@ -157,17 +163,21 @@ class InterpolatedPOD(Surrogate):
             rows = take_array(model, "interpolation", (len(entries), r))
             by_cell[own, entries % (shape[1] * 3)] = rows
             tested = _along_axes(scene, self.cells_, by_cell).reshape(-1, *shape[1:], r)
-        points = reduced_points(
-            scene, self.cells_, np.ones(len(self.cells_)), nodal(scene, self.modes_), tested
-        )
+        rule = self.cells_, np.ones(len(self.cells_)), nodal(scene, self.modes_)
+        points = reduced_points(marked_scene(scene, model), *rule, tested)
         self.subspace_ = Subspace(scene, self.modes_)
         rest = take_array(model, "rest", (r, r))
         try:
             self.problem_ = InterpolatedProblem(points, rest, extent_of(scene))
-        except np.linalg.LinAlgError:
+        except NotPositiveDefiniteError:
             raise InvalidInputError("`rest` must be positive definite.") from None
+        if self.static_correction:
+            self.correction_ = Correction(scene)
 
     def answer(self, forces: Array) -> Array:
+        if self.static_correction:
+            tolerance = self.value("tolerance")
+            return self.correction_.answer(self.problem_, self.modes_, forces, tolerance)
         options = NewtonOptions(self.value("tolerance"))
         return self.subspace_.answer(forces, lambda load: self.problem_.solve(load, options))
 

@@ -2,35 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.elements import GAUSS
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.reduction.basis import SOLVED, accurate_modes
 from mor_bench.reduction.cubature import ecsw_system, sparse_nnls, triangle
 from mor_bench.reduction.moved_points import PointRule, move_points
-from mor_bench.reduction.static_correction import (
-    LINEAR_WEIGHT,
-    corrected_snapshots,
-    predict_corrected,
-    softened,
-)
 from mor_bench.scene.scene import Scene
-from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogates.cubature_states import States, softened_if_locked
-from mor_bench.surrogates.free_dofs import answer_each
+from mor_bench.surrogates.cubature_states import States
 from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced_points
 
 Array = NDArray[np.float64]
 
 MOVED_ONLY = "points move in H8 with full integration only, of a body without sampled parameters"
-CORRECTED_ONLY = "static correction is for loads on a body without contact or sampled parameters"
 
 
 @dataclass(eq=False)
@@ -43,7 +31,7 @@ class HyperReducedPOD(CubatureSurrogate):
 
     Parameters
     ----------
-    n_modes, cubature_tolerance, n_cubature_snapshots, tolerance, matching
+    n_modes, cubature_tolerance, n_cubature_snapshots, tolerance, matching, static_correction
         See `CubatureSurrogate`.
     sampling : {"cells", "points", "moved"}
         "cells": integrate every point of a chosen cell, as published. "points": a second cubature
@@ -53,39 +41,19 @@ class HyperReducedPOD(CubatureSurrogate):
         same tolerance (after Hernández et al. 2024, see `mor_bench.reduction.moved_points`). Half
         as many points suffice, and queries are faster. Fits take longer. Only for H8 with full
         integration and a body without sampled parameters.
-    static_correction : bool
-        Whether to add the part of the linear response that the modes lack. They then span the
-        nonlinear parts of the snapshots, as in `LocalPOD` with one cluster. See
-        `mor_bench.reduction.static_correction`. Not for contact or sampled parameters.
     """
 
     sampling: Literal["cells", "points", "moved"] = "points"
-    static_correction: bool = False
 
     takes_parameters: ClassVar = True
 
     def supports(self, scene: Scene) -> str | None:
         if reason := super().supports(scene):
             return reason
-        if self.static_correction and (scene.contact or scene.parameter_names):
-            return CORRECTED_ONLY
         if self.sampling != "moved":
             return None
         whole = scene.mesh.cells.shape[1] == 8 and not scene.selective
         return None if whole and not scene.parameter_names else MOVED_ONLY
-
-    def choose_modes(self, scene: Scene, samples: Snapshots) -> Array:
-        if not self.static_correction:
-            return super().choose_modes(scene, samples)
-        linear = FullOrderModel(scene).rest_factor.solve(samples.free_forces.T).T
-        snapshots = corrected_snapshots(samples.free_displacements, linear)
-        # The snapshots are smaller than the displacements, and the error of the solver is not.
-        return accurate_modes(snapshots, self.value("n_modes"), SOLVED / LINEAR_WEIGHT)
-
-    def reduced_scene(self, scene: Scene, samples: Snapshots, modes: Array) -> Scene:
-        if not self.static_correction or softened(scene) is scene:
-            return scene
-        return softened_if_locked(FullOrderModel(scene), samples, modes)
 
     def choose_cells(
         self, states: States, modes: Array, tolerance: float
@@ -113,27 +81,6 @@ class HyperReducedPOD(CubatureSurrogate):
             return vars(_moved(states, modes, target, start, tolerance))
         used = factors.any(axis=1)
         return {"cells": cells[used], "weights": factors[used]}
-
-    def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
-        super().prepare(scene, model)
-        if self.static_correction:
-            self.model_ = FullOrderModel(scene)
-            self.compliance_ = Compliance(self.model_)
-
-    def answer(self, forces: Array) -> Array:
-        if not self.static_correction:
-            return super().answer(forces)
-        return answer_each(self.scene_, forces, self._corrected)
-
-    def _corrected(self, load: Array) -> Array:
-        return predict_corrected(
-            self.problem_,
-            self.modes_,
-            self.model_,
-            self.compliance_,
-            load,
-            self.value("tolerance"),
-        )
 
 
 def _moved(

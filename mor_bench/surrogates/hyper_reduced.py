@@ -27,6 +27,12 @@ from mor_bench.scene.scene_at import scale_of
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.corrected import (
+    Correction,
+    corrected_modes,
+    corrected_scene,
+    lacks_correction,
+)
 from mor_bench.surrogates.cubature_states import (
     Matching,
     States,
@@ -88,6 +94,10 @@ class CubatureSurrogate(Surrogate):
         modes, in the norm of the inverse stiffness at rest. It needs fewer cells at an equal error,
         and a solve of plain POD for each training state. "as-needed": "energy" if the projected
         snapshots are far from equilibrium, as in a nearly incompressible body, else "force".
+    static_correction : bool
+        Whether to add the part of the linear response that the modes lack. They then span the
+        nonlinear parts of the snapshots, as in `LocalPOD` with one cluster. See
+        `mor_bench.reduction.static_correction`. Not for contact or sampled parameters.
     """
 
     n_modes: Annotated[int, Field(ge=1)] | Auto = 20
@@ -95,6 +105,7 @@ class CubatureSurrogate(Surrogate):
     n_cubature_snapshots: Annotated[int, Field(ge=1)] = 300
     tolerance: Annotated[float, Field(gt=0, le=1)] | Auto = 1e-8
     matching: Matching = "as-needed"
+    static_correction: bool = False
 
     sized: ClassVar = {
         "n_modes": MODES,
@@ -103,15 +114,9 @@ class CubatureSurrogate(Surrogate):
     }
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene, contact=True)
-
-    def choose_modes(self, scene: Scene, samples: Snapshots) -> Array:
-        """Return the modes (n_free, r)."""
-        return accurate_modes(samples.free_displacements, self.value("n_modes"))
-
-    def reduced_scene(self, scene: Scene, samples: Snapshots, modes: Array) -> Scene:
-        """Return the scene whose law the cells have: the given one, or a softened one."""
-        return scene
+        if reason := unknown_equations(scene, contact=True):
+            return reason
+        return lacks_correction(scene) if self.static_correction else None
 
     @abstractmethod
     def choose_cells(
@@ -125,8 +130,12 @@ class CubatureSurrogate(Surrogate):
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         tolerance = self.value("cubature_tolerance")
-        modes = self.choose_modes(scene, samples)
-        reduced = self.reduced_scene(scene, samples, modes)
+        if self.static_correction:
+            modes = corrected_modes(scene, samples, self.value("n_modes"))
+            reduced = corrected_scene(scene, samples, modes)
+        else:
+            modes = accurate_modes(samples.free_displacements, self.value("n_modes"))
+            reduced = scene
         kept = {"modes": modes, **mark_of(scene, reduced)}
         if tolerance == 0:
             whole = {"cells": np.arange(scene.mesh.n_cells), "weights": np.ones(scene.mesh.n_cells)}
@@ -163,6 +172,8 @@ class CubatureSurrogate(Surrogate):
         self._on_nodes = nodal(scene, self.modes_)
         self.problem_ = self._problem(marked_scene(scene, model))
         self.problem_.prepare()
+        if self.static_correction:
+            self.correction_ = Correction(scene)
         if scene.contact:
             from mor_bench.reduction.pressed_modes import PressedModes  # only such scenes need it
 
@@ -185,6 +196,9 @@ class CubatureSurrogate(Surrogate):
         return CubatureProblem(points, extent_of(scene))
 
     def answer(self, forces: Array) -> Array:
+        if self.static_correction:
+            tolerance = self.value("tolerance")
+            return self.correction_.answer(self.problem_, self.modes_, forces, tolerance)
         options = NewtonOptions(self.value("tolerance"))
         return self.subspace_.answer(
             forces, lambda load: self.problem_.solve(load, options).displacement

@@ -85,6 +85,7 @@ def hyper(size: int) -> list[Contender]:
             "hpod, moved": ("hpod", {"sampling": "moved", "cubature_tolerance": 5e-3}),
             "hpod, cells": ("hpod", {"sampling": "cells", "cubature_tolerance": 5e-3}),
             "ecm": ("ecm", {"cubature_tolerance": 1e-2}),
+            "ecm, corrected": ("ecm", {"cubature_tolerance": 1e-2, "static_correction": True}),
         }
         forms |= {
             f"{name}, {matching}": (method, {**parameters, "matching": matching})
@@ -93,6 +94,7 @@ def hyper(size: int) -> list[Contender]:
     for sampling in ("dofs", "cell-dofs", "cells"):
         chosen = {"sampling": sampling, "n_force_modes": 2 * size}
         forms[f"deim, {sampling}"] = "deim", chosen
+        forms[f"deim, {sampling}, corrected"] = "deim", {**chosen, "static_correction": True}
     common = {"n_modes": size, "tolerance": TOLERANCE}
     return [
         Contender(name, size, method, {**common, **parameters})

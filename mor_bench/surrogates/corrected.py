@@ -1,0 +1,68 @@
+"""Static correction of methods on a reduced mesh: their modes, their law, and their answers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.mechanics.compliance import Compliance
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.basis import SOLVED, accurate_modes
+from mor_bench.reduction.galerkin import CubatureProblem
+from mor_bench.reduction.petrov import InterpolatedProblem
+from mor_bench.reduction.static_correction import (
+    LINEAR_WEIGHT,
+    corrected_snapshots,
+    predict_corrected,
+    softened,
+)
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.surrogates.cubature_states import softened_if_locked
+from mor_bench.surrogates.free_dofs import answer_each
+
+Array = NDArray[np.float64]
+
+CORRECTED_ONLY = "static correction is for loads on a body without contact or sampled parameters"
+
+
+def lacks_correction(scene: Scene) -> str | None:
+    """Return why a scene allows no static correction, or None."""
+    return CORRECTED_ONLY if scene.contact or scene.parameter_names else None
+
+
+def corrected_modes(scene: Scene, samples: Snapshots, n_modes: int) -> Array:
+    """Return modes (n_free, r) of the snapshots' nonlinear parts, see `corrected_snapshots`."""
+    linear = FullOrderModel(scene).rest_factor.solve(samples.free_forces.T).T
+    snapshots = corrected_snapshots(samples.free_displacements, linear)
+    # The snapshots are smaller than the displacements, and the error of the solver is not.
+    return accurate_modes(snapshots, n_modes, SOLVED / LINEAR_WEIGHT)
+
+
+def corrected_scene(scene: Scene, samples: Snapshots, modes: Array) -> Scene:
+    """Return the scene whose law the reduced problem has: the given one, or a softened one."""
+    if softened(scene) is scene:
+        return scene
+    return softened_if_locked(FullOrderModel(scene), samples, modes)
+
+
+class Correction:
+    """The full-order parts of answers with static correction, see `predict_corrected`."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.model = FullOrderModel(scene)
+        self.compliance = Compliance(self.model)
+
+    def answer(
+        self,
+        problem: CubatureProblem | InterpolatedProblem,
+        modes: Array,
+        forces: Array,
+        tolerance: float,
+    ) -> Array:
+        """Return displacements (n, n_nodes, 3), m, under forces of the same shape, N."""
+
+        def solve(load: Array) -> Array:
+            return predict_corrected(problem, modes, self.model, self.compliance, load, tolerance)
+
+        return answer_each(self.model.scene, forces, solve)
