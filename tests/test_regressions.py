@@ -225,6 +225,8 @@ def test_restoring_refuses_unknown_arrays_and_length_scales_too_short_to_divide_
     short = {name: 1e-300 + 0 * model[name] for name in ("points", "lengths")}
     with pytest.raises(InvalidInputError, match="`lengths` must be at least 1e-06"):
         kernel.restore(tiny.scene, model | short)
+    with pytest.raises(InvalidInputError, match="`noise` must be a number >= 0"):
+        kernel.restore(tiny.scene, model | {"noise": np.array([-1.0])})
 
 
 def test_inputs_too_large_for_single_precision_still_reach_a_leaf(
@@ -248,6 +250,32 @@ def test_the_spread_of_an_ensemble_of_trees_is_that_of_its_members(
     np.testing.assert_allclose(forest.spread(forces), away / np.linalg.norm(mean, axis=(1, 2)))
     assert forest.spread(forces).min() > 0
     assert forest.spread(0.0 * forces[0]) == 0.0
+
+
+@pytest.mark.parametrize("name", ["pca-kernel-ridge", "pca-gaussian-process"])
+def test_the_spread_of_a_kernel_is_the_deviation_of_the_gaussian_process(
+    models: dict[str, Any], tiny: Dataset, name: str
+) -> None:
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF
+
+    method, forces = models[name], tiny.test.forces
+    _, outputs, queries = coordinates(method, tiny)
+    n = len(method.points_) - 1
+    noise = np.append(np.full(n, method.arrays_["noise"][0]), 1e-10)
+    targets = np.vstack([outputs[:n], np.zeros((1, outputs.shape[1]))])
+    process = GaussianProcessRegressor(RBF(method.lengths_), alpha=noise, optimizer=None)
+    process.fit(method.points_, targets[:, 0])
+    deviations = process.predict(queries, return_std=True)[1]
+    most_probable = (targets * method.weights_).sum(axis=0) / (n + 1)
+    sizes = deviations * np.sqrt(most_probable.sum())  # the modes are orthonormal
+    expected = sizes / np.linalg.norm(method.predict(forces), axis=(1, 2))
+    np.testing.assert_allclose(method.spread(forces), expected, rtol=1e-3)
+    assert np.median(method.spread(3.0 * forces)) > np.median(method.spread(forces))
+    assert method.spread(0.0 * forces[0]) == 0.0
+    again: Any = mor_bench.load_method(name, **method.parameters)
+    again.restore(tiny.scene, method.arrays_)
+    np.testing.assert_array_equal(again.spread(forces), method.spread(forces))
 
 
 @pytest.mark.parametrize("order", ["generated", "imported"])

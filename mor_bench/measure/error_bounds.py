@@ -28,11 +28,11 @@ LEVEL = 0.9
 
 
 @runtime_checkable
-class Ensemble(Protocol):
-    """A method whose answer is the mean of members that may disagree."""
+class WithSpread(Protocol):
+    """A method that says how uncertain its answers are, such as an ensemble by disagreement."""
 
     def spread(self, forces: ArrayLike) -> NDArray[np.float64]:
-        """Return the disagreement relative to the prediction, of shape () or (n,)."""
+        """Return the uncertainty relative to the prediction, of shape () or (n,)."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class ErrorBound:
     nodes : (n,) int64, optional
         The nodes that count, where the scene's `[needs] outputs` is a part of them.
     per_spread : float, optional
-        Another bound of the same error, of an ensemble: its `spread` times this factor, so that
-        loads on which the members disagree have wider bounds. Infinite as `relative_l2`.
+        Another bound of the same error, of a method with a `spread`: this factor times the spread,
+        so that uncertain answers have wider bounds. Infinite as `relative_l2`.
 
     Examples
     --------
@@ -85,7 +85,7 @@ class ErrorBound:
         displacements : (n_nodes, 3) or (n, n_nodes, 3)
             Predictions û, m.
         spread : float or (n,), optional
-            The ensemble's `spread` for these loads; then b is `per_spread` times it.
+            The method's `spread` for these loads; then b is `per_spread` times it.
 
         Returns
         -------
@@ -94,7 +94,7 @@ class ErrorBound:
         Raises
         ------
         InvalidInputError
-            If a spread is given and the method is no ensemble, or it is no number >= 0 for each
+            If a spread is given and the method has none, or it is no number >= 0 for each
             prediction.
         """
         counting = slice(None) if self.nodes is None else self.nodes
@@ -104,7 +104,7 @@ class ErrorBound:
         if spread is not None:
             if self.per_spread is None:
                 raise InvalidInputError(
-                    "`spread` must be left out: this is not the bound of an ensemble."
+                    "`spread` must be left out: this is not the bound of a method with a spread."
                 )
             given = np.asarray(spread, dtype=np.float64)
             if given.shape not in ((), norm.shape) or not (given >= 0).all():
@@ -149,7 +149,7 @@ def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> 
     >>> error_bound(linear, data.train, level=0.5).relative_l2 < 0.2
     True
 
-    An ensemble also gives every load a bound of its own:
+    A method with a spread also gives every load a bound of its own:
 
     >>> ensemble = mor_bench.load_method("pod-nn-ensemble", iterations=50)
     >>> bound = error_bound(ensemble.fit(data.scene, data.train), data.validation, level=0.5)
@@ -164,7 +164,7 @@ def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> 
     scene, given = samples.scene, samples.given
     predicted = predict_all(method, given)
     errors = sample_errors(predicted, samples.displacements, scene.output_nodes)
-    spreads = method.spread(given.query) if isinstance(method, Ensemble) else None
+    spreads = method.spread(given.query) if isinstance(method, WithSpread) else None
     regions = samples.regions if scene.spec.split.by == "region" else None
     bound = calibrated(errors.relative_l2, regions, level, spreads)
     part = len(scene.output_nodes) < scene.mesh.n_nodes
@@ -188,7 +188,7 @@ def calibrated(
         counts as a group of its own. So does each sample if `regions` is None.
     level : float
     spreads : (n,) float64, optional
-        Those of an ensemble; they give the bound `per_spread`.
+        Those of a method with a spread; they give the bound `per_spread`.
     """
     errors = np.where(np.isnan(errors), inf, errors)
     groups = np.arange(len(errors))
@@ -218,7 +218,7 @@ def covered(
 ) -> dict[str, float]:
     """Return the share of the samples of each test set whose error keeps the bound.
 
-    With `scaled`, it is the bound `per_spread` of an ensemble.
+    With `scaled`, it is the bound `per_spread`.
     """
     share = bound.per_spread if scaled else bound.relative_l2
     if share is None or not isfinite(share):

@@ -30,7 +30,7 @@ class Flagged(Answer):
 
 
 class Spread(Answer):
-    """Disagreement of an ensemble for each load; None for other methods."""
+    """Uncertainty of each answer; None for methods without a spread."""
 
     spread: list[Annotated[float, Field(ge=0)]] | None
 

@@ -24,7 +24,7 @@ from mor_bench.errors import (
     UnknownRangeError,
 )
 from mor_bench.machine import peak_memory_bytes, pinned_threads
-from mor_bench.measure.error_bounds import Ensemble
+from mor_bench.measure.error_bounds import WithSpread
 from mor_bench.measure.fit_clock import fit_clock
 from mor_bench.measure.method_answers import ANSWERS
 from mor_bench.measure.predictions import predict_all
@@ -118,7 +118,7 @@ class MethodSession(Session):
         "throughput": "timing batches",
         "cost": "counting the cost",
         "flag": "flagging loads out of range",
-        "spread": "measuring the disagreement of an ensemble",
+        "spread": "measuring the spread",
     }
     answers: ClassVar[Mapping[str, type[Answer]]] = ANSWERS
 
@@ -213,8 +213,8 @@ class MethodSession(Session):
         return {"flagged": [bool(flag) for flag in flagged]}
 
     def spread(self, forces: Array, parameters: Array | None = None) -> dict[str, Any]:
-        """Return how much the members of an ensemble disagree; None for other methods."""
-        if not isinstance(self.method, Ensemble):
+        """Return how uncertain the answers are; None for methods without a spread."""
+        if not isinstance(self.method, WithSpread):
             return {"spread": None}
         found = self.method.spread(given_of(self.scene, forces, parameters).query)
         if found.shape != (len(forces),) or not (found >= 0).all():

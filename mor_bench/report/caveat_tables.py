@@ -123,8 +123,9 @@ def error_bounds(entries: Sequence[Entry]) -> TextTable | None:
     scales = [e.row.bound.scaled for e in bounded if e.row.bound]
     if any(scaled and scaled.widths for scaled in scales):
         note += (
-            " × spread: every load has a bound of its own, proportional to the disagreement of "
-            "the ensemble. Its median over the test set stands in parentheses (%)."
+            " × spread: every load has a bound of its own, proportional to how uncertain the "
+            "method is: the disagreement of an ensemble, or the standard deviation of a Gaussian "
+            "process. Its median over the test set stands in parentheses (%)."
         )
     headings = ["configuration", "bound (%)", "samples in groups", *names]
     return TextTable("Error bounds", note, headings, rows)

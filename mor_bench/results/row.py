@@ -165,7 +165,7 @@ class RangeFlags(Part):
 
 
 class ScaledBound(Part):
-    """A bound of the error that is a multiple of the spread of an ensemble.
+    """A bound of the error that is a multiple of the spread of a method.
 
     Attributes
     ----------
@@ -194,7 +194,7 @@ class BoundQuality(Part):
     coverage : dict of str to float
         Share of the samples of each test set whose error is within the bound.
     scaled : ScaledBound or None
-        The bound that follows the spread of an ensemble.
+        The bound that follows the spread of a method.
     """
 
     level: Real

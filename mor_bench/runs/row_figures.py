@@ -72,7 +72,7 @@ def failed_set(n: int, seed: int) -> SetErrors:
 
 
 def scaled_bound(bound: ErrorBound, tests: Mapping[str, Score]) -> ScaledBound | None:
-    """Return the bound that follows an ensemble's spread, on each test set; None without spread."""
+    """Return the bound that follows the spread, on each test set; None without a spread."""
     if bound.per_spread is None:
         return None
     known = np.isfinite(bound.per_spread)

@@ -239,9 +239,7 @@ class CoordinateRegression(Surrogate, ABC):
         """Return how much the members of an ensemble disagree, of shape () or (n,).
 
         It is the root mean square over the members of the norm of their deviation from the mean,
-        divided by the norm of the prediction. It is infinite if a load gives a prediction of zero,
-        and zero without load. It is no bound of an error: `mor_bench.error_bound` finds the factor
-        that makes it one.
+        see `relative_spread`.
 
         Parameters
         ----------
@@ -255,13 +253,37 @@ class CoordinateRegression(Surrogate, ABC):
         InvalidInputError, NotFittedError
             As in `predict`.
         """
+
+        def apart(z: Array) -> Array:
+            found = members(z)
+            squared = (self.norms_of(found - found.mean(axis=0)) ** 2).mean(axis=0)
+            return np.asarray(np.sqrt(squared))
+
+        return self.relative_spread(forces, apart)
+
+    def relative_spread(self, forces: ArrayLike, sizes: Callable[[Array], Array]) -> Array:
+        """Return uncertainties relative to the norm of the prediction, of shape () or (n,).
+
+        They are infinite if a load gives a prediction of zero, and zero without load. They are no
+        bounds of errors: `mor_bench.error_bound` finds the factor that makes them bounds.
+
+        Parameters
+        ----------
+        forces : (n_nodes, 3) or (n, n_nodes, 3), or ObservedDisplacements
+            As in `predict`.
+        sizes : callable
+            Returns uncertainties (n,), m, at inputs z (n, n_inputs).
+
+        Raises
+        ------
+        InvalidInputError, NotFittedError
+            As in `predict`.
+        """
         predicted = np.nan_to_num(self.predict(forces))
         given = checked_given(self.scene_, forces).values
-        found = members(self.inputs_of(given))
-        squared = (self.norms_of(found - found.mean(axis=0)) ** 2).mean(axis=0)
         norms = np.linalg.norm(predicted.reshape(given.shape), axis=(1, 2))
         relative = np.where(given.any(axis=(1, 2)), np.inf, 0.0)
-        np.divide(np.sqrt(squared), norms, out=relative, where=norms > 0)
+        np.divide(sizes(self.inputs_of(given)), norms, out=relative, where=norms > 0)
         return np.asarray(relative.reshape(np.shape(predicted)[:-2]))
 
     def _driving(self, forces: Array) -> Array:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
 from mor_bench.counting import count
@@ -42,6 +44,9 @@ LEAST_NOISE = 1e-10
 """Smallest noise, used at the origin, where the value is known; a fraction of the targets'
 variance."""
 
+LEAST_VARIANCE = 1e-14
+"""Smallest variance of an answer, a fraction of that before the samples."""
+
 
 def gaussian_kernel(a: Array, b: Array) -> Array:
     """Return k(a, b) = exp(-|a - b|² / 2) of points (n, d) and (m, d), as (n, m)."""
@@ -52,7 +57,10 @@ def gaussian_kernel(a: Array, b: Array) -> Array:
 class GaussianSums(CoordinateRegression):
     """g(z) = Σ_i w_i k(z, z_i) with the Gaussian kernel.
 
-    One of the z_i is the origin, whose weight makes g(0) = 0.
+    The last z_i is the origin, whose weight makes g(0) = 0. This is the mean of a Gaussian process
+    that is conditioned on the samples, with the ridge as the variance of their noise (Rasmussen,
+    Williams: Gaussian Processes for Machine Learning, 2006, section 2.2). The process also gives
+    the uncertainty of each answer.
     """
 
     n_points: int
@@ -65,11 +73,14 @@ class GaussianSums(CoordinateRegression):
             "points": (n_points, n_inputs),
             "weights": (n_points, n_outputs),
             "lengths": (n_inputs,),
+            "noise": (1,),
         }
 
     def take(self, model: dict[str, NDArray[Any]]) -> None:
         self.points_, self.weights_ = model["points"], model["weights"]
-        self.lengths_ = model["lengths"]
+        self.lengths_, self.noise_ = model["lengths"], float(model["noise"][0])
+        if not 0 <= self.noise_ < np.inf:
+            raise InvalidInputError("`noise` must be a number >= 0.")
         if not (self.lengths_ >= SHORTEST).all():
             raise InvalidInputError(f"`lengths` must be at least {SHORTEST:g}.")
         scaled = self.points_ / self.lengths_
@@ -90,6 +101,35 @@ class GaussianSums(CoordinateRegression):
         out = np.exp(exponents, out=exponents) @ self.weights_
         out[~z.any(axis=1)] = 0.0  # the sum there is round-off
         return np.asarray(out)
+
+    def spread(self, forces: ArrayLike) -> Array:
+        """Return the standard deviation of each answer relative to it, of shape () or (n,).
+
+        It is that of the Gaussian process, with the prior variance of each output that makes the
+        samples most probable. A query costs one product with the square of the number of points.
+        Parameters and errors are those of `relative_spread`.
+        """
+        return self.relative_spread(forces, self._deviations)
+
+    def _deviations(self, z: Array) -> Array:
+        """Return the standard deviation of Φ g at inputs z (n, n_inputs), (n,), m."""
+        lower, prior = self._posterior
+        to_points = gaussian_kernel(z / self.lengths_, self.points_ / self.lengths_)
+        known = solve_triangular(lower, to_points.T, lower=True)
+        # Round-off leaves no digits of a smaller variance.
+        left = np.maximum(1.0 - (known**2).sum(axis=0), LEAST_VARIANCE)
+        return np.asarray(prior * np.sqrt(left))
+
+    @cached_property
+    def _posterior(self) -> tuple[Array, float]:
+        """Cholesky factor of the covariance of the samples, and the prior deviation of Φ g, m."""
+        scaled = self.points_ / self.lengths_
+        noise = np.full(len(scaled), max(self.noise_, LEAST_NOISE))
+        noise[-1] = LEAST_NOISE
+        covariance = gaussian_kernel(scaled, scaled) + np.diag(noise)
+        lower = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+        sizes = np.sqrt(((lower.T @ self.weights_) ** 2).mean(axis=0))
+        return lower, float(np.linalg.norm(self.norms_of(np.diag(sizes))))
 
 
 @dataclass(eq=False)
@@ -138,6 +178,7 @@ class PCAKernelRidge(GaussianSums):
             "points": np.vstack([z, origin]),
             "weights": np.vstack([weights, -to_origin.T @ weights]),
             "lengths": np.full(z.shape[1], length),
+            "noise": np.array([self.ridge]),
         }
 
 
@@ -148,8 +189,8 @@ class PCAGaussianProcess(GaussianSums):
     The prior covariance is a Gaussian kernel with a length scale for each input, the same for all
     outputs; g(0) = 0 is an observation without noise. Length scales, variance and noise maximise
     the likelihood of the first `n_optimised` samples and the first `N_LEADING` outputs. L-BFGS-B
-    takes at most `MAX_ITERATIONS` steps from one start. Then the mean is conditioned on the first
-    `n_points` samples; only the mean is kept.
+    takes at most `MAX_ITERATIONS` steps from one start. Then the process is conditioned on the
+    first `n_points` samples.
 
     `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
 
@@ -186,14 +227,15 @@ class PCAGaussianProcess(GaussianSums):
             chosen.fit(z[: self.n_optimised], targets[: self.n_optimised, :N_LEADING] / scale)
         variance = chosen.kernel_.k1.k1.constant_value
         lengths = np.atleast_1d(chosen.kernel_.k1.k2.length_scale)
-        noise = np.append(np.full(len(z), chosen.kernel_.k2.noise_level), LEAST_NOISE) / variance
+        noise = max(chosen.kernel_.k2.noise_level / variance, LEAST_NOISE)
         points = np.vstack([z, np.zeros((1, z.shape[1]))])
         process = GaussianProcessRegressor(
-            RBF(lengths), alpha=np.maximum(noise, LEAST_NOISE), optimizer=None
+            RBF(lengths), alpha=np.append(np.full(len(z), noise), LEAST_NOISE), optimizer=None
         )
         process.fit(points, np.vstack([targets, np.zeros((1, targets.shape[1]))]))
         weights = process.alpha_.reshape(len(points), -1)
-        return {"points": points, "weights": weights, "lengths": lengths}
+        kept = {"points": points, "weights": weights, "lengths": lengths}
+        return kept | {"noise": np.array([noise])}
 
 
 def _optimised(objective: Any, start: Any, bounds: Any) -> tuple[Array, float]:
