@@ -13,7 +13,7 @@ from mor_bench.measure.mesh_limit import known_error
 from mor_bench.report.number_format import DASH, number
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import load_method_spec
-from tests.published import projection_tables
+from tests.published import bound_tables, projection_tables
 from tests.published.choice_tables import choices, choices_decided
 from tests.published.cost_tables import (
     generation,
@@ -393,6 +393,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "reconstructions": projection_tables.reconstructions,
     "softened-volume": projection_tables.softened_volume,
     "response-inputs": projection_tables.response_inputs,
+    "spread-bounds": bound_tables.spread_bounds,
     "learning-curves": learning_curves,
     "training-iterations": training_iterations,
     "training-samples": training_samples,
