@@ -65,7 +65,8 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 """Methods, and parameters that replace those of their files.
 
-Those without iterations are fitted to the numbers of samples alone, once for each.
+Those without iterations are fitted to the numbers of samples alone. Methods without a seed are
+fitted once for each number.
 """
 
 BY_DEFAULT = ["pod-nn", "autoencoder"]
@@ -83,7 +84,7 @@ FLAT = 0.05
 class Point:
     """A training: all but the seed says where it stands on a curve.
 
-    A method without iterations has none, and one seed.
+    A method may have no iterations, and a method without a seed has one point.
     """
 
     method: str
@@ -94,8 +95,15 @@ class Point:
     @property
     def parameters(self) -> dict[str, Any]:
         """Parameters of the method."""
-        drawn = {"iterations": self.iterations, "seed": self.seed} if self.iterations else {}
-        return METHODS[self.method] | drawn
+        seed = {"seed": self.seed} if takes_seed(self.method) else {}
+        iterations = {"iterations": self.iterations} if self.iterations else {}
+        return METHODS[self.method] | iterations | seed
+
+
+@cache
+def takes_seed(method: str) -> bool:
+    """Return whether a method draws random numbers."""
+    return "seed" in mor_bench.load_method(method).parameters
 
 
 @cache
@@ -153,7 +161,7 @@ class Curves:
 
     def of_all_seeds(self, method: str, n_train: int, iterations: int) -> list[dict[str, Any]]:
         """Return the points of all seeds; train for those that are not known."""
-        seeds = SEEDS if iterations else SEEDS[:1]
+        seeds = SEEDS if takes_seed(method) else SEEDS[:1]
         wanted = [Point(method, n_train, iterations, seed) for seed in seeds]
         unknown = [one for one in wanted if self._known(one) is None]
         running = [self.trainings.submit(trained, self.dataset, one) for one in unknown]
