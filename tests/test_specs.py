@@ -12,6 +12,7 @@ import pytest
 import mor_bench
 from mor_bench.errors import MissingDependencyError, MorBenchError, RenamedWarning, SpecError
 from mor_bench.report.published_figures import SAME_AMPLITUDE, scene_of
+from mor_bench.runs.configurations import MOST_CONFIGURATIONS
 from mor_bench.runs.file_check import check_file
 from mor_bench.specs import list_suite, load_generated_spec, load_method_spec
 
@@ -79,7 +80,7 @@ def test_a_dataset_at_the_deformation_of_the_paper_has_only_larger_forces(name: 
 
 
 @pytest.mark.parametrize("name", list_suite("methods"))
-def test_every_shipped_method_is_valid_and_sweeps_different_configurations(name: str) -> None:
+def test_every_shipped_method_is_valid_and_its_sweep_fits_the_budget(name: str) -> None:
     try:
         assert check_file(list_suite("methods")[name]).startswith("method, ")
     except MissingDependencyError as error:
@@ -88,6 +89,7 @@ def test_every_shipped_method_is_valid_and_sweeps_different_configurations(name:
     for profile in ("quick", "full"):
         configurations = [repr(found) for found in spec.configurations(profile)]
         assert len(set(configurations)) == len(configurations) > 0
+        assert len(configurations) <= MOST_CONFIGURATIONS[profile]  # a run skips the rest
 
 
 @pytest.mark.parametrize("name", list_suite("methods"))
