@@ -256,19 +256,17 @@ def test_the_spread_of_an_ensemble_of_trees_is_that_of_its_members(
 def test_the_spread_of_a_kernel_is_the_deviation_of_the_gaussian_process(
     models: dict[str, Any], tiny: Dataset, name: str
 ) -> None:
-    from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF
 
     method, forces = models[name], tiny.test.forces
     _, outputs, queries = coordinates(method, tiny)
-    n = len(method.points_) - 1
-    noise = np.append(np.full(n, method.arrays_["noise"][0]), 1e-10)
-    targets = np.vstack([outputs[:n], np.zeros((1, outputs.shape[1]))])
-    process = GaussianProcessRegressor(RBF(method.lengths_), alpha=noise, optimizer=None)
-    process.fit(method.points_, targets[:, 0])
-    deviations = process.predict(queries, return_std=True)[1]
-    most_probable = (targets * method.weights_).sum(axis=0) / (n + 1)
-    sizes = deviations * np.sqrt(most_probable.sum())  # the modes are orthonormal
+    kernel, points, n = RBF(method.lengths_), method.points_, len(method.points_) - 1
+    noise = np.append(np.full(n, method.arrays_["noise"][0]), 0.0)  # the origin is known
+    to_points = kernel(queries, points)
+    known = np.linalg.solve(kernel(points) + np.diag(noise), to_points.T)
+    variance = 1.0 - (to_points * known.T).sum(axis=1)
+    most_probable = (outputs[:n] * method.weights_[:n]).sum(axis=0) / n
+    sizes = np.sqrt(variance * most_probable.sum())  # the modes are orthonormal
     expected = sizes / np.linalg.norm(method.predict(forces), axis=(1, 2))
     np.testing.assert_allclose(method.spread(forces), expected, rtol=1e-3)
     assert np.median(method.spread(3.0 * forces)) > np.median(method.spread(forces))
@@ -276,6 +274,20 @@ def test_the_spread_of_a_kernel_is_the_deviation_of_the_gaussian_process(
     again: Any = mor_bench.load_method(name, **method.parameters)
     again.restore(tiny.scene, method.arrays_)
     np.testing.assert_array_equal(again.spread(forces), method.spread(forces))
+
+
+@pytest.mark.parametrize("name", ["pca-kernel-ridge", "pca-gaussian-process"])
+def test_kernels_keep_small_loads_accurate_and_certain(
+    models: dict[str, Any], tiny: Dataset, name: str
+) -> None:
+    method = models[name]
+    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+    for factor in (1e-2, 1e-4):
+        forces = factor * tiny.test.forces
+        expected = linear.predict(forces)
+        apart = np.linalg.norm(method.predict(forces) - expected, axis=(1, 2))
+        assert np.median(apart / np.linalg.norm(expected, axis=(1, 2))) < 0.01
+        assert np.median(method.spread(forces)) < 1.5 * np.median(method.spread(tiny.test.forces))
 
 
 @pytest.mark.parametrize("order", ["generated", "imported"])

@@ -42,14 +42,15 @@ def test_static_correction_over_all_cells_is_that_of_a_single_local_basis(
     assert np.abs(corrected.predict(train.forces) - local).max() <= 1e-9 * size
     small = 1e-6 * train.forces
     linear = LinearFEM().fit(scene, None).predict(small)
-    for few in (
+    methods: list[Any] = [
         HyperReducedPOD(5, 1e-2, static_correction=True),
         EmpiricalCubaturePOD(5, 1e-2, static_correction=True),
         *(
             InterpolatedPOD(5, 10, sampling=sampling, static_correction=True)
             for sampling in ("dofs", "cell-dofs", "cells")
         ),
-    ):
+    ]
+    for few in methods:
         few.fit(scene, train)
         assert len(few.cells_) < scene.mesh.n_cells
         assert np.abs(few.predict(train.forces) - local).max() <= 0.03 * size

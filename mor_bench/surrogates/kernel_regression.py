@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
-from scipy.linalg import solve_triangular
+from scipy.linalg import solve, solve_triangular
 from scipy.optimize import minimize
 
 from mor_bench.counting import count
@@ -41,11 +41,23 @@ LARGEST = 1e50
 """Largest ratio of points to length scales; its square and products with loads are finite."""
 
 LEAST_NOISE = 1e-10
-"""Smallest noise, used at the origin, where the value is known; a fraction of the targets'
-variance."""
+"""Smallest noise, a fraction of the targets' variance."""
 
 LEAST_VARIANCE = 1e-14
 """Smallest variance of an answer, a fraction of that before the samples."""
+
+
+def kernel_from_rest(a: Array, b: Array) -> Array:
+    """Return k(a, b) - k(a, 0) k(0, b) of points (n, d) and (m, d), as (n, m).
+
+    It is the covariance of a process with the covariance k and g(0) = 0. Near the origin it is
+    small, and keeps its digits.
+    """
+    products = a @ b.T
+    apart = -0.5 * ((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1))  # logarithm of the second
+    near = np.exp(apart) * np.expm1(np.minimum(products, 1.0))
+    far = np.exp(np.minimum(apart + products, 0.0)) - np.exp(apart)
+    return np.asarray(np.where(products < 1.0, near, far))
 
 
 def gaussian_kernel(a: Array, b: Array) -> Array:
@@ -58,9 +70,9 @@ class GaussianSums(CoordinateRegression):
     """g(z) = Σ_i w_i k(z, z_i) with the Gaussian kernel.
 
     The last z_i is the origin, whose weight makes g(0) = 0. This is the mean of a Gaussian process
-    that is conditioned on the samples, with the ridge as the variance of their noise (Rasmussen,
-    Williams: Gaussian Processes for Machine Learning, 2006, section 2.2). The process also gives
-    the uncertainty of each answer.
+    with g(0) = 0 that is conditioned on the samples, with the ridge as the variance of their noise
+    (Rasmussen, Williams: Gaussian Processes for Machine Learning, 2006, section 2.2). The process
+    also gives the uncertainty of each answer.
     """
 
     n_points: int
@@ -106,30 +118,39 @@ class GaussianSums(CoordinateRegression):
         """Return the standard deviation of each answer relative to it, of shape () or (n,).
 
         It is that of the Gaussian process, with the prior variance of each output that makes the
-        samples most probable. A query costs one product with the square of the number of points.
-        Parameters and errors are those of `relative_spread`.
+        samples most probable. The first call factorises the covariance of the n points. Each load
+        costs n² / 2 multiply-adds. Parameters and errors are those of `relative_spread`.
         """
         return self.relative_spread(forces, self._deviations)
 
     def _deviations(self, z: Array) -> Array:
         """Return the standard deviation of Φ g at inputs z (n, n_inputs), (n,), m."""
         lower, prior = self._posterior
-        to_points = gaussian_kernel(z / self.lengths_, self.points_ / self.lengths_)
-        known = solve_triangular(lower, to_points.T, lower=True)
+        scaled = z / self.lengths_
+        to_points = kernel_from_rest(scaled, self.points_[:-1] / self.lengths_)
+        known = solve_triangular(lower, to_points.T, lower=True, check_finite=False)
+        before = -np.expm1(-(scaled**2).sum(axis=1))
         # Round-off leaves no digits of a smaller variance.
-        left = np.maximum(1.0 - (known**2).sum(axis=0), LEAST_VARIANCE)
+        left = np.maximum(before - (known**2).sum(axis=0), LEAST_VARIANCE * before)
         return np.asarray(prior * np.sqrt(left))
 
     @cached_property
     def _posterior(self) -> tuple[Array, float]:
         """Cholesky factor of the covariance of the samples, and the prior deviation of Φ g, m."""
-        scaled = self.points_ / self.lengths_
-        noise = np.full(len(scaled), max(self.noise_, LEAST_NOISE))
-        noise[-1] = LEAST_NOISE
-        covariance = gaussian_kernel(scaled, scaled) + np.diag(noise)
-        lower = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-        sizes = np.sqrt(((lower.T @ self.weights_) ** 2).mean(axis=0))
+        scaled = self.points_[:-1] / self.lengths_
+        noise = max(self.noise_, LEAST_NOISE) * np.eye(len(scaled))
+        lower = np.asarray(np.linalg.cholesky(kernel_from_rest(scaled, scaled) + noise), np.float64)
+        sizes = np.sqrt(((lower.T @ self.weights_[:-1]) ** 2).mean(axis=0))
         return lower, float(np.linalg.norm(self.norms_of(np.diag(sizes))))
+
+
+def weights_from_rest(kernel_weights: Array, scaled: Array) -> Array:
+    """Return the weights (n + 1, m) of k for those (n, m) of `kernel_from_rest` at points (n, d).
+
+    The last one is that of the origin.
+    """
+    to_rest = gaussian_kernel(scaled, np.zeros((1, scaled.shape[1])))
+    return np.vstack([kernel_weights, -to_rest.T @ kernel_weights])
 
 
 @dataclass(eq=False)
@@ -167,16 +188,12 @@ class PCAKernelRidge(GaussianSums):
         from sklearn.kernel_ridge import KernelRidge
 
         z, targets = samples.z[: self.n_points], samples.values[: self.n_points]
-        origin = np.zeros((1, z.shape[1]))
         length = float(self.length_scale or LENGTH_SCALES[self.input])
-        scaled = z / length
-        to_origin = gaussian_kernel(scaled, origin)
-        kernel = gaussian_kernel(scaled, scaled) - to_origin @ to_origin.T
+        kernel = kernel_from_rest(z / length, z / length)
         regression = KernelRidge(alpha=self.ridge, kernel="precomputed").fit(kernel, targets)
-        weights = regression.dual_coef_
         return {
-            "points": np.vstack([z, origin]),
-            "weights": np.vstack([weights, -to_origin.T @ weights]),
+            "points": np.vstack([z, np.zeros((1, z.shape[1]))]),
+            "weights": weights_from_rest(regression.dual_coef_, z / length),
             "lengths": np.full(z.shape[1], length),
             "noise": np.array([self.ridge]),
         }
@@ -187,7 +204,7 @@ class PCAGaussianProcess(GaussianSums):
     """Gaussian-process regression between principal coordinates; see `CoordinateRegression`.
 
     The prior covariance is a Gaussian kernel with a length scale for each input, the same for all
-    outputs; g(0) = 0 is an observation without noise. Length scales, variance and noise maximise
+    outputs, and g(0) = 0. Length scales, variance and noise maximise
     the likelihood of the first `n_optimised` samples and the first `N_LEADING` outputs. L-BFGS-B
     takes at most `MAX_ITERATIONS` steps from one start. Then the process is conditioned on the
     first `n_points` samples.
@@ -228,14 +245,14 @@ class PCAGaussianProcess(GaussianSums):
         variance = chosen.kernel_.k1.k1.constant_value
         lengths = np.atleast_1d(chosen.kernel_.k1.k2.length_scale)
         noise = max(chosen.kernel_.k2.noise_level / variance, LEAST_NOISE)
-        points = np.vstack([z, np.zeros((1, z.shape[1]))])
-        process = GaussianProcessRegressor(
-            RBF(lengths), alpha=np.append(np.full(len(z), noise), LEAST_NOISE), optimizer=None
-        )
-        process.fit(points, np.vstack([targets, np.zeros((1, targets.shape[1]))]))
-        weights = process.alpha_.reshape(len(points), -1)
-        kept = {"points": points, "weights": weights, "lengths": lengths}
-        return kept | {"noise": np.array([noise])}
+        scaled = z / lengths
+        covariance = kernel_from_rest(scaled, scaled) + noise * np.eye(len(z))
+        return {
+            "points": np.vstack([z, np.zeros((1, z.shape[1]))]),
+            "weights": weights_from_rest(solve(covariance, targets, assume_a="pos"), scaled),
+            "lengths": lengths,
+            "noise": np.array([noise]),
+        }
 
 
 def _optimised(objective: Any, start: Any, bounds: Any) -> tuple[Array, float]:

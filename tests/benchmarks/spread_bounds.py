@@ -2,8 +2,9 @@
 
     python -m tests.benchmarks.spread_bounds --json spread-bounds.json
 
-Both are calibrated on the same validation samples. A part of the test samples has new load regions,
-one has those of the training, and one has larger loads than those of training and calibration.
+Both are calibrated on the same validation samples. Test loads act on new regions between those of
+the training, on the same regions, or on a part of the surface without training loads, or they are
+larger than those of training and calibration.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 import mor_bench
 from mor_bench.machine import pinned_threads
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.test_sets import SetName
 from tests.benchmarks.projections import ErrorsFile, write_rows
 
 Array = NDArray[np.float64]
@@ -33,6 +35,8 @@ METHODS = (
     "pca-extra-trees",
     "pod-nn-ensemble",
 )
+OUTSIDE: SetName = "unseen-regions"
+"""Test set on a part of the surface without training loads."""
 SMALL = 0.6
 """Share of the loads, by size, that count as small."""
 
@@ -48,9 +52,11 @@ class Parts:
 
 
 def parts_of(scene: str) -> Iterator[Parts]:
-    """Yield the three ways to take apart the samples of a scene."""
-    by_region = mor_bench.load_dataset(scene, limit=LIMIT, split="region")
+    """Yield the four ways to take apart the samples of a scene."""
+    by_region = mor_bench.load_dataset(scene, limit=LIMIT, split="region", tests=(OUTSIDE,))
     yield Parts("new regions", by_region.train, by_region.validation, by_region.test)
+    outside = by_region.tests[OUTSIDE]
+    yield Parts("other part of the surface", by_region.train, by_region.validation, outside)
     mixed = mor_bench.load_dataset(scene, limit=LIMIT, split="sample")
     yield Parts("same regions", mixed.train, mixed.validation, mixed.test)
     limit = float(np.quantile(sizes_of(mixed.train), SMALL))

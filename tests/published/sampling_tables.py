@@ -11,27 +11,27 @@ from mor_bench.report.number_format import DASH, number
 from tests.published.run_tables import markdown
 from tests.published.stored import content_of
 
-COMPARED = 320
-"""Number of snapshots whose cost is shown."""
-
 
 def learning_curves(source: str, dataset: str, method: str) -> str:
     """Show the errors of a method over its number of snapshots, for each way to choose them.
 
-    The figures are medians over the repetitions.
+    The figures are medians over the repetitions. The cost is that of the most snapshots that all
+    ways have.
     """
     rows = content_of(source)[dataset]["methods"][method]
     found = {(row["way"], row["n"]): row for row in rows}
     sizes = sorted({row["n"] for row in rows})
-    base_s = core_seconds(found["random", COMPARED])
+    ways = list(dict.fromkeys(row["way"] for row in rows))
+    compared = max(n for n in sizes if all((way, n) in found for way in ways))
+    base_s = core_seconds(found["random", compared])
     body = []
-    for way in dict.fromkeys(row["way"] for row in rows):
+    for way in ways:
         cells = [_errors(found.get((way, n))) for n in sizes]
-        core_s = core_seconds(found[way, COMPARED])
-        cost = [number(1e3 * core_s / COMPARED), number(core_s / base_s)]
+        core_s = core_seconds(found[way, compared])
+        cost = [number(1e3 * core_s / compared), number(core_s / base_s)]
         body.append([way, *cells, *cost])
     headings = ["median %; p95 %", *(f"n = {n}" for n in sizes)]
-    headings += [f"core-ms per snapshot, n = {COMPARED}", "over random"]
+    headings += [f"core-ms per snapshot, n = {compared}", "over random"]
     return markdown(headings, body)
 
 
