@@ -196,6 +196,11 @@ def trained(data: Dataset, size: Size, checkpoint: Path) -> dict[str, Any]:
         }
 
 
+def _checkpoint(report: Path, size: Size) -> Path:
+    channels, steps, iterations = size
+    return report.with_suffix(f".{channels}-{steps}-{iterations}.checkpoint")
+
+
 def main(
     dataset: Annotated[str, typer.Option(help="Name or TOML file.")] = "beam-coarse-paper",
     report: Annotated[
@@ -222,7 +227,7 @@ def main(
     wanted = [(c, k, n) for c, k, most in SIZES for n in ITERATIONS if n <= most]
     wanted = wanted if only is None else [only]
     for size in sorted(set(wanted) - known, key=lambda s: (s[0] * s[2], s)):
-        rows.append(trained(data, size, report.with_suffix(".checkpoint")))
+        rows.append(trained(data, size, _checkpoint(report, size)))
         print(f"{size}: {rows[-1]['test']['mean_dof_m']:.3g} m", flush=True)
         write_atomically(report, (json.dumps({**setting, "rows": rows}, indent=1) + "\n").encode())
 
