@@ -14,7 +14,6 @@ from mor_bench.reduction.static_correction import (
     LINEAR_WEIGHT,
     corrected_snapshots,
     predict_corrected,
-    softened,
 )
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -31,19 +30,22 @@ def lacks_correction(scene: Scene) -> str | None:
     return CORRECTED_ONLY if scene.contact or scene.parameter_names else None
 
 
-def corrected_modes(scene: Scene, samples: Snapshots, n_modes: int) -> Array:
-    """Return modes (n_free, r) of the snapshots' nonlinear parts, see `corrected_snapshots`."""
-    linear = FullOrderModel(scene).rest_factor.solve(samples.free_forces.T).T
+def basis_of(
+    scene: Scene, samples: Snapshots, n_modes: int, static_correction: bool
+) -> tuple[Array, Scene]:
+    """Return modes (n_free, r), and the scene whose law the reduced problem has.
+
+    With static correction, the modes are those of the snapshots' nonlinear parts, see
+    `corrected_snapshots`, and the law may be softened.
+    """
+    if not static_correction:
+        return accurate_modes(samples.free_displacements, n_modes), scene
+    model = FullOrderModel(scene)
+    linear = model.rest_factor.solve(samples.free_forces.T).T
     snapshots = corrected_snapshots(samples.free_displacements, linear)
     # The snapshots are smaller than the displacements, and the error of the solver is not.
-    return accurate_modes(snapshots, n_modes, SOLVED / LINEAR_WEIGHT)
-
-
-def corrected_scene(scene: Scene, samples: Snapshots, modes: Array) -> Scene:
-    """Return the scene whose law the reduced problem has: the given one, or a softened one."""
-    if softened(scene) is scene:
-        return scene
-    return softened_if_locked(FullOrderModel(scene), samples, modes)
+    modes = accurate_modes(snapshots, n_modes, SOLVED / LINEAR_WEIGHT)
+    return modes, softened_if_locked(model, samples, modes)
 
 
 class Correction:

@@ -15,7 +15,7 @@ from mor_bench.mechanics.linear import NotPositiveDefiniteError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.model_arrays import take_array, take_indices
-from mor_bench.reduction.basis import accurate_modes, pod
+from mor_bench.reduction.basis import pod
 from mor_bench.reduction.discrete_interpolation import Selection, interpolation_rows
 from mor_bench.reduction.galerkin import stiffness_times
 from mor_bench.reduction.petrov import InterpolatedProblem
@@ -26,7 +26,7 @@ from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogates.corrected import Correction, corrected_modes, corrected_scene
+from mor_bench.surrogates.corrected import Correction, basis_of
 from mor_bench.surrogates.cubature_states import (
     are_far,
     equilibria,
@@ -100,12 +100,7 @@ class InterpolatedPOD(Surrogate):
         return unknown_equations(scene)
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
-        if self.static_correction:
-            modes = corrected_modes(scene, samples, self.value("n_modes"))
-            reduced = corrected_scene(scene, samples, modes)
-        else:
-            modes = accurate_modes(samples.free_displacements, self.value("n_modes"))
-            reduced = scene
+        modes, reduced = basis_of(scene, samples, self.value("n_modes"), self.static_correction)
         model = FullOrderModel(reduced)
         stiff = stiffness_times(model.assembler.pattern, model.rest_tangent, modes)
         q = self._coordinates(reduced, samples, modes)

@@ -16,7 +16,6 @@ from mor_bench.mechanics.model import body_of, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.mechanics.parametric import Bodies
 from mor_bench.model_arrays import take_array, take_indices
-from mor_bench.reduction.basis import accurate_modes
 from mor_bench.reduction.galerkin import CubatureProblem
 from mor_bench.reduction.points import ReducedPoints
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto
@@ -27,12 +26,7 @@ from mor_bench.scene.scene_at import scale_of
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogates.corrected import (
-    Correction,
-    corrected_modes,
-    corrected_scene,
-    lacks_correction,
-)
+from mor_bench.surrogates.corrected import Correction, basis_of, lacks_correction
 from mor_bench.surrogates.cubature_states import (
     Matching,
     States,
@@ -130,12 +124,7 @@ class CubatureSurrogate(Surrogate):
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         tolerance = self.value("cubature_tolerance")
-        if self.static_correction:
-            modes = corrected_modes(scene, samples, self.value("n_modes"))
-            reduced = corrected_scene(scene, samples, modes)
-        else:
-            modes = accurate_modes(samples.free_displacements, self.value("n_modes"))
-            reduced = scene
+        modes, reduced = basis_of(scene, samples, self.value("n_modes"), self.static_correction)
         kept = {"modes": modes, **mark_of(scene, reduced)}
         if tolerance == 0:
             whole = {"cells": np.arange(scene.mesh.n_cells), "weights": np.ones(scene.mesh.n_cells)}
