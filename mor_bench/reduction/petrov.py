@@ -57,7 +57,6 @@ class InterpolatedProblem:
         with uncounted():
             self._linear = rest - points.force_and_tangent(np.zeros(len(rest)))[1]
             self.rest_factor = dense_factor(rest)
-        self._rest = rest
 
     def linearise(self, q: Array) -> tuple[Array, Array, float]:
         """Return force, tangent, and min det F over the sampled cells."""
@@ -83,7 +82,7 @@ class InterpolatedProblem:
             raise InvalidInputError(
                 f"the reduced load must be within ±{MAX_LOAD_N:g} N; got {np.abs(load).max():g}."
             )
-        start = _factored(self._rest, load)[0]
+        start = self.rest_factor.solve(load)
         if np.abs(start).max() <= LINEAR * self.extent:
             return start
         q, _, iterations = self._newton(load, start, options.tolerance, damped=False)

@@ -1,4 +1,4 @@
-"""Static correction of methods on a reduced mesh: their modes, their law, and their answers."""
+"""Static correction of reduced methods: their modes, their law, and their answers."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.basis import SOLVED, accurate_modes
-from mor_bench.reduction.galerkin import CubatureProblem
+from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem
 from mor_bench.reduction.petrov import InterpolatedProblem
 from mor_bench.reduction.static_correction import (
     LINEAR_WEIGHT,
     corrected_snapshots,
     predict_corrected,
 )
+from mor_bench.reduction.tensors import TensorProblem
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogates.cubature_states import softened_if_locked
@@ -57,7 +58,7 @@ class Correction:
 
     def answer(
         self,
-        problem: CubatureProblem | InterpolatedProblem,
+        problem: GalerkinProblem | CubatureProblem | TensorProblem | InterpolatedProblem,
         modes: Array,
         forces: Array,
         tolerance: float,

@@ -50,20 +50,14 @@ LEAST_VARIANCE = 1e-14
 def kernel_from_rest(a: Array, b: Array) -> Array:
     """Return k(a, b) - k(a, 0) k(0, b) of points (n, d) and (m, d), as (n, m).
 
-    It is the covariance of a process with the covariance k and g(0) = 0. Near the origin it is
-    small, and keeps its digits.
+    With k(a, b) = exp(-|a - b|² / 2), it is the covariance of a process with the covariance k and
+    g(0) = 0. Near the origin it is small, and keeps its digits.
     """
     products = a @ b.T
     apart = -0.5 * ((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1))  # logarithm of the second
     near = np.exp(apart) * np.expm1(np.minimum(products, 1.0))
     far = np.exp(np.minimum(apart + products, 0.0)) - np.exp(apart)
     return np.asarray(np.where(products < 1.0, near, far))
-
-
-def gaussian_kernel(a: Array, b: Array) -> Array:
-    """Return k(a, b) = exp(-|a - b|² / 2) of points (n, d) and (m, d), as (n, m)."""
-    squares = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
-    return np.asarray(np.exp(-0.5 * np.maximum(squares, 0.0)))
 
 
 class GaussianSums(CoordinateRegression):
@@ -149,8 +143,8 @@ def weights_from_rest(kernel_weights: Array, scaled: Array) -> Array:
 
     The last one is that of the origin.
     """
-    to_rest = gaussian_kernel(scaled, np.zeros((1, scaled.shape[1])))
-    return np.vstack([kernel_weights, -to_rest.T @ kernel_weights])
+    to_rest = np.exp(-0.5 * (scaled**2).sum(axis=1))
+    return np.vstack([kernel_weights, -to_rest @ kernel_weights])
 
 
 @dataclass(eq=False)
@@ -204,10 +198,9 @@ class PCAGaussianProcess(GaussianSums):
     """Gaussian-process regression between principal coordinates; see `CoordinateRegression`.
 
     The prior covariance is a Gaussian kernel with a length scale for each input, the same for all
-    outputs, and g(0) = 0. Length scales, variance and noise maximise
-    the likelihood of the first `n_optimised` samples and the first `N_LEADING` outputs. L-BFGS-B
-    takes at most `MAX_ITERATIONS` steps from one start. Then the process is conditioned on the
-    first `n_points` samples.
+    outputs, and g(0) = 0. Length scales, variance and noise maximise the likelihood of the first
+    `n_optimised` samples and the first `N_LEADING` outputs. L-BFGS-B takes at most `MAX_ITERATIONS`
+    steps from one start. Then the process is conditioned on the first `n_points` samples.
 
     `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
 

@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.derivative_modes import derivative_basis, patch_responses
-from mor_bench.reduction.static_correction import model_of, predict_corrected, softened
+from mor_bench.reduction.static_correction import model_of, softened
 from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.specs.load_ranges import largest_of
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogates.free_dofs import answer_each, galerkin_or_polynomial
+from mor_bench.surrogates.corrected import Correction
+from mor_bench.surrogates.free_dofs import galerkin_or_polynomial
 
 N_WATCHED = 300
 """Linear responses to the largest loads that decide where det F is monitored."""
@@ -69,16 +69,10 @@ class ModalDerivatives(Surrogate):
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
         self.modes_ = take_array(model, "modes", (len(scene.free_dofs), None))
-        self.model_ = FullOrderModel(scene)
-        reduced = model_of(softened(scene), self.model_)
+        self.correction_ = Correction(scene)
+        reduced = model_of(softened(scene), self.correction_.model)
         self.problem_ = galerkin_or_polynomial(scene, reduced, self.modes_, model)
-        self.compliance_ = Compliance(self.model_)
         self.problem_.prepare()
 
     def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        return answer_each(self.scene_, forces, self._solve)
-
-    def _solve(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
-        return predict_corrected(
-            self.problem_, self.modes_, self.model_, self.compliance_, load, self.tolerance
-        )
+        return self.correction_.answer(self.problem_, self.modes_, forces, self.tolerance)
