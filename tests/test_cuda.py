@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,17 @@ def test_recorded_steps_change_the_weights_as_others_do(
 def test_a_training_repeats_to_the_last_digit(data: Dataset) -> None:
     one, other = fitted(data, "cuda"), fitted(data, "cuda")
     assert np.array_equal(one.predict(data.test.forces), other.predict(data.test.forces))
+
+
+def test_trainings_side_by_side_record_and_validate(data: Dataset) -> None:
+    chosen = {"validation_fraction": 0.2, "batch_size": 7}
+    alone = fitted(data, "cuda", parameters=chosen)
+    with ThreadPoolExecutor(6) as threads:
+        running = [threads.submit(fitted, data, "cuda", parameters=chosen) for _ in range(12)]
+        beside = [one.result() for one in running]
+    assert not torch.backends.cudnn.benchmark
+    wanted = alone.predict(data.test.forces)
+    assert max(difference(one.predict(data.test.forces), wanted) for one in beside) < ROUNDING
 
 
 def test_a_stopped_training_resumes(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
+from threading import Lock, RLock
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +19,42 @@ from mor_bench.errors import UnavailableBackendError
 N_UNRECORDED = 3
 """Steps or queries before the recording; they choose algorithms and allocate workspace."""
 
+ALONE = RLock()
+"""Held by a thread that records, or that computes without replay beside threads that may record.
+
+The search for a convolution's algorithm frees memory, and the start of a recording waits for the
+whole device. Neither is allowed while another thread records.
+"""
+
+
+class FastConvolutions:
+    """The search for the fastest deterministic convolutions, switched on while a thread needs it.
+
+    PyTorch has one such setting for all threads. The last thread to leave restores it.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._n_inside = Lock(), 0
+        self._before = False, False
+
+    def __enter__(self) -> None:
+        cudnn = torch.backends.cudnn
+        with self._lock:
+            if self._n_inside == 0:
+                self._before = cudnn.benchmark, cudnn.deterministic
+                cudnn.benchmark, cudnn.deterministic = True, True
+            self._n_inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        cudnn = torch.backends.cudnn
+        with self._lock:
+            self._n_inside -= 1
+            if self._n_inside == 0:
+                cudnn.benchmark, cudnn.deterministic = self._before
+
+
+_FAST_CONVOLUTIONS = FastConvolutions()
+
 
 @contextmanager
 def own_stream() -> Iterator[None]:
@@ -26,17 +63,14 @@ def own_stream() -> Iterator[None]:
     Recording needs a stream that is not the default one. Trainings in several threads run side by
     side, each in its own stream.
     """
-    cudnn = torch.backends.cudnn
-    before = cudnn.benchmark, cudnn.deterministic
     stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
     stream.wait_stream(torch.cuda.current_stream())
-    cudnn.benchmark, cudnn.deterministic = True, True
-    try:
-        with torch.cuda.stream(stream):
-            yield
-    finally:
-        stream.synchronize()
-        cudnn.benchmark, cudnn.deterministic = before
+    with _FAST_CONVOLUTIONS:
+        try:
+            with torch.cuda.stream(stream):
+                yield
+        finally:
+            stream.synchronize()
 
 
 def volumes_last(network: nn.Module) -> nn.Module:
@@ -109,7 +143,7 @@ class ReplayedNetwork:
         return self._answer.clone()
 
     def _record(self, inputs: Tensor) -> None:
-        with own_stream():
+        with ALONE, own_stream():
             self._given = torch.empty_like(inputs, pin_memory=True)
             for _ in range(N_UNRECORDED):
                 answer = self._network(inputs.to("cuda"))

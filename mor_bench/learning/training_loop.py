@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mor_bench.errors import MorBenchError
-from mor_bench.learning.cuda_graphs import N_UNRECORDED, RecordedStep
+from mor_bench.learning.cuda_graphs import ALONE, N_UNRECORDED, RecordedStep
 from mor_bench.learning.training_plan import LearningProblem, TrainingPlan, rate_factor
 from mor_bench.training_options import TrainingOptions
 
@@ -167,13 +167,20 @@ class TrainingLoop:
         if self._recorded is None and 0 < self._n_unrecorded < self._n_taken:
             for group in groups:
                 group["capturable"], group["lr"] = True, torch.tensor(rate, device=self.device)
-            self._recorded = RecordedStep(self._changed, rows)
+            with ALONE:
+                self._recorded = RecordedStep(self._changed, rows)
         for group in groups:
             if self._recorded is None:
                 group["lr"] = rate
             else:
                 group["lr"].fill_(rate)
-        return self._changed(rows) if self._recorded is None else self._recorded(rows)
+        if self._recorded is not None:
+            return self._recorded(rows)
+        with self._without_replay():
+            return self._changed(rows)
+
+    def _without_replay(self) -> AbstractContextManager[object]:
+        return ALONE if self.device.type == "cuda" else nullcontext()
 
     def _changed(self, rows: Tensor) -> Tensor:
         """Change the weights by the gradient of the loss of some samples; return the loss."""
@@ -199,7 +206,7 @@ class TrainingLoop:
     def validate(self) -> None:
         """Append the loss of the held-out samples, and keep the weights if it is the lowest."""
         self.network.eval()
-        with torch.no_grad(), self._products():
+        with self._without_replay(), torch.no_grad(), self._products():
             parts = [
                 (len(rows), self.problem.loss(rows.to(self.device)))
                 for rows in torch.split(self.held, self.plan.batch_size)

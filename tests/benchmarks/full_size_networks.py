@@ -4,18 +4,19 @@
 
 The datasets have the deformation of the paper of U-Mesh, the split is at random, and a batch has
 four samples, as in that paper. `umesh-small` has the batches of its file. All trainings run side by
-side, each in its own stream, because one small batch does not fill a graphics processor. Times of
-queries are measured after all trainings.
+side, each in its own stream, because one small batch does not fill a graphics processor. Products
+in float32 are rounded to TF32. Times of queries are measured after all trainings; they do not
+depend on the weights, so few iterations and samples are enough for them.
 """
 
 from __future__ import annotations
 
 import json
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
-from threading import Event, Thread
+from threading import Thread
 from time import perf_counter
 from typing import Annotated, Any
 
@@ -25,7 +26,7 @@ import typer
 from numpy.typing import NDArray
 
 import mor_bench
-from mor_bench.learning.cuda_graphs import ReplayedNetwork, volumes_last
+from mor_bench.learning.cuda_graphs import ALONE, ReplayedNetwork, volumes_last
 from mor_bench.machine import gpu_name
 from mor_bench.measure.error_metrics import sample_errors, summary
 from mor_bench.report.published_figures import SCENES
@@ -99,8 +100,6 @@ class Contestant:
     method : Surrogate
     finished : SimpleQueue
         Receives this object when its training has ended.
-    started : Event
-        Set when the steps are recorded.
     seconds : float
         Wall time of the fit, beside the other trainings.
     error : Exception or None
@@ -113,7 +112,6 @@ class Contestant:
     train: Snapshots
     method: Any
     finished: SimpleQueue[Contestant]
-    started: Event = field(default_factory=Event)
     seconds: float = 0.0
     error: Exception | None = None
 
@@ -125,11 +123,9 @@ class Contestant:
         except Exception as error:
             self.error = error
         self.seconds = perf_counter() - begun
-        self.started.set()
         self.finished.put(self)
 
     def _progress(self, done: int, planned: int, loss: float) -> None:
-        self.started.set()
         if done % max(1, planned // 20) == 0:
             print(
                 f"{self.method_name}, {self.name}: {done} of {planned}, loss {loss:.3g}", flush=True
@@ -201,9 +197,10 @@ def scored(contestant: Contestant, samples: Snapshots) -> dict[str, float]:
         network: Any = network_of(method).to("cuda")
         evaluate: Any = lambda fields: network(network.encode(fields.to("cuda"))).cpu()  # noqa: E731
         method.evaluate = evaluate  # type: ignore[method-assign]
-    predicted: NDArray[np.float64] = np.concatenate(
-        [method.predict(samples[i : i + 64].forces) for i in range(0, len(samples), 64)]
-    )
+    with ALONE:
+        predicted: NDArray[np.float64] = np.concatenate(
+            [method.predict(samples[i : i + 64].forces) for i in range(0, len(samples), 64)]
+        )
     found = summary(sample_errors(predicted, samples.displacements))
     return {name: found[name] for name in SCORES}
 
@@ -229,7 +226,9 @@ def row_of(contestant: Contestant) -> dict[str, Any]:
     return row
 
 
-def contestant_of(text: str, iterations: int, finished: SimpleQueue[Contestant]) -> Contestant:
+def contestant_of(
+    text: str, iterations: int, limit: int | None, finished: SimpleQueue[Contestant]
+) -> Contestant:
     """Return a network and its samples from [METHOD[KEY=VALUE]@]DATASET[:ITERATIONS[:SAMPLES]].
 
     The method is U-Mesh by default. It learns from the samples of training and validation, without
@@ -237,7 +236,7 @@ def contestant_of(text: str, iterations: int, finished: SimpleQueue[Contestant])
     number have loads of another seed.
     """
     chosen, _, rest = text.rpartition("@")
-    method_name, _ = split_method(chosen or "umesh")
+    method_name, given = split_method(chosen or "umesh")
     name, *numbers = rest.split(":")
     if name not in AT_THE_PAPERS_DEFORMATION:
         known = ", ".join(AT_THE_PAPERS_DEFORMATION)
@@ -247,11 +246,11 @@ def contestant_of(text: str, iterations: int, finished: SimpleQueue[Contestant])
         raise typer.BadParameter(f"a method must be one of {known_methods}; got {method_name!r}.")
     network = AT_THE_PAPERS_DEFORMATION[name].network
     umesh = {"channels": network.channels, "steps": network.steps, **UMESH}
-    parameters = OTHERS.get(method_name, umesh)
+    parameters = {k: v for k, v in OTHERS.get(method_name, umesh).items() if k not in given}
     method = mor_bench.load_method(
         chosen or "umesh", **parameters, iterations=int(numbers[0]) if numbers else iterations
     )
-    data = mor_bench.load_dataset(name, split="sample")
+    data = mor_bench.load_dataset(name, limit, split="sample")
     train = data.train if _holds_out(method) else joined(data.train, data.validation)
     if len(numbers) > 1:
         if (more := int(numbers[1]) - len(train)) < 1:
@@ -281,20 +280,19 @@ def main(
         ),
     ] = None,
     iterations: Annotated[int, typer.Option(help="By default as in the paper.")] = 100_000,
+    limit: Annotated[int | None, typer.Option(help="Samples of a dataset; all by default.")] = None,
     report: Annotated[
         Path, typer.Option("--json", metavar="FILE", help="Write the rows here.")
     ] = Path("full-size-networks.json"),
 ) -> None:
     """Train networks in their full sizes on a graphics processor."""
-    torch.backends.cuda.matmul.allow_tf32 = True
-    torch.backends.cudnn.allow_tf32 = False  # for small networks; large ones train in bfloat16
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
     finished: SimpleQueue[Contestant] = SimpleQueue()
     names = scenes or list(AT_THE_PAPERS_DEFORMATION)
     for text in names:
-        one = contestant_of(text, iterations, finished)
+        one = contestant_of(text, iterations, limit, finished)
         print(f"{text}: {len(one.train)} training samples", flush=True)
         Thread(target=one.fit, daemon=True).start()
-        one.started.wait()  # one recording at a time
     found: dict[str, Any] = {"gpu": gpu_name(), "torch": torch.__version__, "rows": []}
     ended = []
     for _ in names:
@@ -303,7 +301,6 @@ def main(
         found["rows"].append(row)
         print(row["method"], row["dataset"], row.get("error") or row["test"], flush=True)
         write_atomically(report, (json.dumps(found, indent=1) + "\n").encode())
-    torch.backends.cudnn.allow_tf32 = True
     for one, row in zip(ended, found["rows"], strict=True):
         if one.error is None:
             row["latency_ms"] = latency(one)

@@ -6,12 +6,14 @@ Every point is a training of its own, with its own learning-rate schedule. The i
 until two doublings in a row each lower the error on validation samples by less than 5 %, but at
 least to the number in the method's file, or until a training would take longer than the limit.
 Points that the file has already are not trained again, so that the same command continues after an
-interruption.
+interruption. Trainings on a graphics processor run side by side in one process; their points have
+no core-seconds.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
@@ -19,7 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from threading import Lock
-from time import process_time
+from time import perf_counter, process_time
 from typing import Annotated, Any
 
 import typer
@@ -29,6 +31,7 @@ from mor_bench.machine import pinned_threads
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import load_method_spec
+from mor_bench.training_options import TrainingOptions
 from tests.benchmarks.choices import scored
 
 LINEAR_RESPONSE = {"input": "linear-response"}
@@ -111,6 +114,21 @@ def dataset_of(name: str) -> Dataset:
     return mor_bench.load_dataset(name)
 
 
+def trained_on_gpu(dataset: str, wanted: Point) -> dict[str, Any]:
+    """Return a point with its seconds beside other trainings, and its errors."""
+    data = dataset_of(dataset)
+    made: Any = mor_bench.load_method(wanted.method, **wanted.parameters)
+    made.training = TrainingOptions(device="cuda")
+    begun = perf_counter()
+    made.fit(data.scene, data.train[: wanted.n_train])
+    return {
+        **vars(wanted),
+        "gpu_s": perf_counter() - begun,
+        "validation": scored(made, data.validation),
+        "test": scored(made, data.test),
+    }
+
+
 def trained(dataset: str, wanted: Point) -> dict[str, Any]:
     """Return a point with its core-seconds and its errors of validation and test."""
     data = dataset_of(dataset)
@@ -131,6 +149,11 @@ def trained(dataset: str, wanted: Point) -> dict[str, Any]:
         }
 
 
+def seconds_of(point: dict[str, Any]) -> float:
+    """Return the core-seconds of a point, or its seconds on a graphics processor."""
+    return float(point["gpu_s"] if "gpu_s" in point else point["core_s"])
+
+
 @dataclass
 class Curves:
     """The points of all curves, in a file that each new point extends.
@@ -140,9 +163,12 @@ class Curves:
     dataset : str
     file : Path
     trainings : Executor
-        Trains the points, each in one process.
-    most_core_s : float
-        Longest training, in core-seconds, as the one before it predicts.
+        Trains the points, each in one process, or in one thread for a graphics processor.
+    train : callable
+        `trained` or `trained_on_gpu`.
+    most_s : float
+        Longest training, in core-seconds or seconds of a graphics processor, as the one before it
+        predicts.
     points : list of dict
         Method, samples, iterations, seed, core-seconds, and errors of validation and test.
     """
@@ -150,7 +176,8 @@ class Curves:
     dataset: str
     file: Path
     trainings: Executor
-    most_core_s: float
+    train: Callable[[str, Point], dict[str, Any]]
+    most_s: float
     points: list[dict[str, Any]] = field(default_factory=list)
     lock: Lock = field(default_factory=Lock)
 
@@ -164,7 +191,7 @@ class Curves:
         seeds = SEEDS if takes_seed(method) else SEEDS[:1]
         wanted = [Point(method, n_train, iterations, seed) for seed in seeds]
         unknown = [one for one in wanted if self._known(one) is None]
-        running = [self.trainings.submit(trained, self.dataset, one) for one in unknown]
+        running = [self.trainings.submit(self.train, self.dataset, one) for one in unknown]
         for one in running:
             self._add(one.result())
         return [found for one in wanted if (found := self._known(one)) is not None]
@@ -180,7 +207,7 @@ class Curves:
             write_atomically(self.file, (json.dumps(content, indent=1) + "\n").encode())
         names = [str(found[name]) for name in ("method", "n_train", "iterations", "seed")]
         error = f"{found['test']['mean_dof_m']:.3g} m"
-        print(*names, f"{found['core_s']:.0f} core-s", error, flush=True)
+        print(*names, f"{seconds_of(found):.0f} s", error, flush=True)
 
     def iterate(self, method: str, n_train: int, usual: int) -> None:
         """Double the iterations until the curve stays flat or the limit is met."""
@@ -188,9 +215,9 @@ class Curves:
         for share in SHARES:
             found = self.of_all_seeds(method, n_train, round(share * usual))
             error = median(point["validation"]["mean_dof_m"] for point in found)
-            core_s = median(point["core_s"] for point in found)
+            seconds = median(seconds_of(point) for point in found)
             n_flat = n_flat + 1 if error > (1 - FLAT) * before else 0
-            if (n_flat >= 2 and share >= 1) or 2 * core_s > self.most_core_s:
+            if (n_flat >= 2 and share >= 1) or 2 * seconds > self.most_s:
                 break
             before = error
         self.of_all_seeds(method, n_train, usual)
@@ -200,6 +227,7 @@ def main(
     dataset: Annotated[str, typer.Option(help="Name or TOML file.")] = "beam-coarse",
     method: Annotated[list[str], typer.Option(help="One of METHODS.")] = BY_DEFAULT,
     most_core_s: Annotated[float, typer.Option(help="Longest training, core-seconds.")] = 120.0,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     jobs: Annotated[int, typer.Option(help="Trainings side by side.")] = 1,
     report: Annotated[
         Path,
@@ -208,11 +236,12 @@ def main(
 ) -> None:
     """Measure errors of networks over numbers of iterations and of training samples."""
     whole = len(dataset_of(dataset).train)
-    with (
-        ProcessPoolExecutor(jobs, get_context("spawn")) as trainings,
-        ThreadPoolExecutor(jobs) as waiting,
-    ):
-        curves = Curves(dataset, report, trainings, most_core_s)
+    pool: Executor = ProcessPoolExecutor(jobs, get_context("spawn"))
+    train = trained
+    if device == "cuda":
+        pool, train = ThreadPoolExecutor(jobs), trained_on_gpu
+    with pool as trainings, ThreadPoolExecutor(jobs) as waiting:
+        curves = Curves(dataset, report, trainings, train, most_core_s)
         curves.read()
         running: list[Future[Any]] = []
         for name in method:
