@@ -1,4 +1,4 @@
-"""Polynomials of high degree in few coordinates: their terms, and the gain from choosing them."""
+"""Polynomials in coordinates: their terms, the gain from choosing them, and small monomials."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
-from mor_bench.snapshots.dataset import Dataset
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.greedy import solved
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.surrogates.coordinate_regression import CoordinateSamples
 from mor_bench.surrogates.monomials import (
     MAX_DEGREE,
@@ -63,7 +66,7 @@ def test_a_high_degree_in_one_coordinate_is_found_from_few_samples() -> None:
     assert len(terms) < 60
 
 
-def test_sparse_terms_beat_the_full_cubic_and_derivatives_help_with_few_samples(
+def test_derivatives_help_with_few_samples(
     tiny_without_validation: Dataset,
 ) -> None:
     tiny = tiny_without_validation
@@ -71,13 +74,11 @@ def test_sparse_terms_beat_the_full_cubic_and_derivatives_help_with_few_samples(
     errors = [
         median_error(mor_bench.load_method(name, **knobs).fit(tiny.scene, few), tiny.test)
         for name, knobs in (
-            ("pca-regression-linear", {"n_input_modes": 20}),
             ("sparse-polynomial", {}),
             ("sparse-polynomial-derivative", {"max_terms": 100}),
         )
     ]
     assert errors[1] <= 0.6 * errors[0]
-    assert errors[2] <= 0.6 * errors[1]
 
 
 def test_training_loads_are_learned_from_either_input_and_zero_load_gives_zero(
@@ -112,3 +113,16 @@ def test_damaged_terms_are_refused(spoil: Any) -> None:
 def test_terms_can_be_restored_from_their_array() -> None:
     terms = cheapest_terms(np.array([0.4, 0.9, 1.3]), 25)
     assert terms_from_array(terms_to_array(terms), 3) == terms
+
+
+def test_monomials_that_nearly_vanish_in_training_get_no_large_weights(tiny: Dataset) -> None:
+    def snapshots(data: Snapshots, factor: float) -> Snapshots:
+        vectors = data.loads.vectors * [1.0, 1.0, factor]
+        return solved(FullOrderModel(tiny.scene), PatchLoads(data.loads.patches, vectors))
+
+    flat, other = snapshots(tiny.train, 0.01), snapshots(tiny.test, 0.3)
+    method, linear = (
+        mor_bench.load_method(name).fit(tiny.scene, flat)
+        for name in ("pca-regression-linear", "linear-fem")
+    )
+    assert median_error(method, other) < 0.5 * median_error(linear, other)

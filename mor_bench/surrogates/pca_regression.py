@@ -21,6 +21,13 @@ from mor_bench.surrogates.coordinate_regression import (
 )
 from mor_bench.surrogates.monomials import Monomials, monomial_indices, n_monomials
 
+LEAST_SCALE = 1e-2
+"""Least divisor of a monomial in the fit, over the largest one.
+
+A monomial that is nearly zero under all training loads is not under others. Divided by its own
+root mean square, it would get a large weight for a small penalty.
+"""
+
 MAX_FEATURE_BYTES = 2 * 2**30
 """Largest size of the monomials of all training samples, bytes; a fit holds several copies."""
 
@@ -29,7 +36,8 @@ MAX_FEATURE_BYTES = 2 * 2**30
 class PCARegression(CoordinateRegression):
     """g(z) = W p(z), with p the monomials of z, by ridge regression; see `CoordinateRegression`.
 
-    `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
+    The fit minimises errors relative to the displacement of each sample. `input`, `n_input_modes`
+    and `n_output_modes` are those of `CoordinateRegression`.
 
     Parameters
     ----------
@@ -38,7 +46,7 @@ class PCARegression(CoordinateRegression):
         they need more than `MAX_FEATURE_BYTES`.
     ridge : float
         Tikhonov weight relative to the mean squared feature, with features scaled to unit root mean
-        square.
+        square; small ones less, see `LEAST_SCALE`.
     """
 
     input: Input = "linear-response"
@@ -63,11 +71,13 @@ class PCARegression(CoordinateRegression):
         features = Monomials(n_variables, monomial_indices(n_variables, self.degree))(samples.z)
         used = self._vanishing(n_variables)
         features = features if used.all() else features[:, used]
-        feature_scale = np.sqrt((features**2).mean(axis=0))
+        scale = np.sqrt((features**2).mean(axis=0))
+        scale = np.maximum(scale, LEAST_SCALE * scale.max())
+        squared = samples.weights[:, 0] ** 2
         regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
-        regression.fit(features / feature_scale, samples.values)
+        regression.fit(features / scale, samples.values, sample_weight=squared / squared.mean())
         weights = np.zeros((samples.values.shape[1], n))
-        weights[:, used] = np.atleast_2d(regression.coef_) / feature_scale
+        weights[:, used] = np.atleast_2d(regression.coef_) / scale
         return {"weights": weights}
 
     def _vanishing(self, n_variables: int) -> NDArray[np.bool_]:
