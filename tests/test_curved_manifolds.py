@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
 import mor_bench
+from mor_bench.errors import InvalidInputError
 from mor_bench.learning.network_map import NetworkMap
 from mor_bench.reduction.curved import CoordinateMap, CurvedLoad, CurvedProblem, QuadraticMap
 from mor_bench.reduction.derivative_modes import pairs
 from mor_bench.snapshots.dataset import Dataset
+from mor_bench.specs import load_generated_spec
 from mor_bench.surrogates.curved_pod import CurvedPOD
+from tests.relative_errors import median_error
 
 CHEAP = {"n_latent": 4, "n_secondary": 10, "cubature_tolerance": 0.0}
 TRAINED = {"n_hidden": 8, "iterations": 150}
@@ -141,3 +147,22 @@ def test_a_cubature_on_the_manifold_keeps_few_cells_and_the_answer(tiny: Dataset
     full, sampled = (method.predict(tiny.test.forces[:20]) for method in methods)
     off = np.linalg.norm(sampled - full, axis=(1, 2)) / np.linalg.norm(full, axis=(1, 2))
     assert np.median(off) < 0.05
+
+
+@pytest.fixture(scope="module")
+def one_cell(cache: Path) -> Dataset:
+    spec = load_generated_spec("beam-tiny")
+    geometry: Any = spec.geometry
+    cell = {"geometry": geometry.model_copy(update={"cells": (1, 1, 1)})}
+    return mor_bench.load_dataset(spec.model_copy(update=cell), cache=cache, workers=1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_body_of_one_cell_has_few_modes(name: str, one_cell: Dataset) -> None:
+    cheap = {key: value for key, value in TRAINED.items() if key in NAMES[name]}
+    method = mor_bench.load_method(name, n_latent=3, **cheap).fit(one_cell.scene, one_cell.train)
+    assert isinstance(method, CurvedPOD)
+    assert method.space_.shape == (12, 12)
+    assert median_error(method, one_cell.test) < 0.01
+    with pytest.raises(InvalidInputError, match="less than the rank of the snapshots, 12"):
+        mor_bench.load_method(name, n_latent=20, **cheap).fit(one_cell.scene, one_cell.train)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.counting import count
+from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.compliance import Compliance, project
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
@@ -52,7 +53,7 @@ class CurvedPOD(Surrogate):
     Parameters
     ----------
     n_latent : int
-        Number r of latent coordinates q; capped at the snapshots' rank with a warning.
+        Number r of latent coordinates q, less than the snapshots' rank.
     n_secondary : int
         Number of secondary modes, capped at the rank of what the primary ones leave.
     static_correction : bool
@@ -105,8 +106,15 @@ class CurvedPOD(Surrogate):
             offsets = offsets - samples.free_forces @ _primary_response(model, primary) @ primary.T
         targets = displacements - offsets
         rest = pod(targets - targets @ primary @ primary.T, self.n_secondary).modes
-        # The remainder may be small against the primary part, so round-off is projected out.
-        secondary = np.linalg.qr(rest - primary @ (primary.T @ rest))[0]
+        # The remainder may be small against the primary part, so round-off is projected out. A mode
+        # of round-off alone may lie in the primary span, and little of it is left.
+        rest = rest - primary @ (primary.T @ rest)
+        secondary = np.linalg.qr(rest[:, np.linalg.norm(rest, axis=0) > 0.5])[0]
+        if not secondary.size:
+            raise InvalidInputError(
+                f"`n_latent` must be less than the rank of the snapshots, {primary.shape[1]}, "
+                f"because their other modes are learned; got {self.n_latent}."
+            )
         modes = np.hstack([primary, secondary])
         arrays, latent = self.fit_map(scene, samples, targets @ modes, primary.shape[1])
         weights, reduced = np.ones(scene.mesh.n_cells), scene
