@@ -27,6 +27,9 @@ SIZES = {
 }
 """Parameters that set the size of a network, by method."""
 
+N_LAST = 5
+"""Points at the end of a loss curve, of 100 to 200, whose mean is its loss at the end."""
+
 MEASURED = {"dataset": "beam-coarse-paper", "channels": 128, "steps": 3}
 """The training in the paper's size beside which the scaling laws stand."""
 
@@ -123,15 +126,37 @@ def paper_size(source: str) -> str:
 
 
 def paper_size_latency(source: str) -> str:
-    """Show the times of single queries of the paper's networks on a graphics processor."""
+    """Show the times of single queries of the paper's networks on a graphics processor.
+
+    SOURCE is FILE,FILE,….
+    """
     body = []
-    for row in content_of(source)["rows"]:
+    for row in _rows_of(source):
         times = [row["latency_ms"][name] for name in ("predict", "replayed", "launched")]
         cells = [f"{number(found['median'])}; {number(found['p95'])}" for found in times]
         published = number(_published(row).predict_ms)
         body.append([row["dataset"], f"{row['n_weights']:,}", *cells, published])
     headings = ["dataset", "weights", "whole query, ms", "network, replayed, ms"]
     return markdown([*headings, "network, launched by PyTorch, ms", "paper's query, ms"], body)
+
+
+def recipes(source: str) -> str:
+    """Show the errors and the loss of trainings that differ by precision and learning rate."""
+    body = [
+        [
+            row["precision"],
+            number(row["learning_rate"]),
+            f"{row['iterations']:,}",
+            _metres(row["test"]["mean_dof_m"]),
+            " / ".join(number(100 * row["test"][f"rel_l2_{name}"]) for name in ENDS),
+            number(row["test"]["slope"]),
+            number(sum(row["loss_curve"][-N_LAST:]) / N_LAST),
+        ]
+        for row in _rows_of(source)
+    ]
+    headings = ["precision", "peak of the learning rate", "iterations", "ē, m"]
+    headings += ["relative L2 error, %: median / p95 / max", "slope", "loss at the end"]
+    return markdown(headings, body)
 
 
 def full_sizes(source: str, dataset: str) -> str:

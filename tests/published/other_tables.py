@@ -13,7 +13,7 @@ from mor_bench.measure.mesh_limit import known_error
 from mor_bench.report.number_format import DASH, number
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import load_method_spec
-from tests.published import bound_tables, projection_tables
+from tests.published import bound_tables, network_size_tables, projection_tables
 from tests.published.choice_tables import choices, choices_decided
 from tests.published.cost_tables import (
     generation,
@@ -25,14 +25,6 @@ from tests.published.cost_tables import (
 )
 from tests.published.front_tables import fronts, fronts_of_all, nothing_slower
 from tests.published.literature_table import literature
-from tests.published.network_size_tables import (
-    full_sizes,
-    network_size_law,
-    network_sizes,
-    paper_size,
-    paper_size_latency,
-    training_speed,
-)
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.sampling_tables import learning_curves
@@ -368,16 +360,17 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "random-loads": random_loads,
     "choices": choices,
     "choices-decided": choices_decided,
-    "network-sizes": network_sizes,
-    "network-size-law": network_size_law,
+    "network-sizes": network_size_tables.network_sizes,
+    "network-size-law": network_size_tables.network_size_law,
     "fronts": fronts,
     "fronts-of-all": fronts_of_all,
     "nothing-slower": nothing_slower,
     "stresses": stresses,
-    "full-sizes": full_sizes,
-    "training-speed": training_speed,
-    "paper-size": paper_size,
-    "paper-size-latency": paper_size_latency,
+    "full-sizes": network_size_tables.full_sizes,
+    "training-speed": network_size_tables.training_speed,
+    "paper-size": network_size_tables.paper_size,
+    "paper-size-latency": network_size_tables.paper_size_latency,
+    "recipes": network_size_tables.recipes,
     "paper-amplitude": paper_amplitude,
     "records": records,
     "optimism": optimism,

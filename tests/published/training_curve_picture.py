@@ -18,7 +18,8 @@ BASELINE = "reports/learned/region/results.json"
 CAPTION = (
     "Mean error of test samples over the core-seconds of a training, a line per network. "
     "Each point is a training of its own: the median error of three seeds, and the time of the "
-    "fastest."
+    "fastest. Trainings on a graphics processor stand at the time that shorter ones predict for a "
+    "core."
 )
 
 

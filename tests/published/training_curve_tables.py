@@ -44,8 +44,22 @@ def curves_of(source: str) -> dict[str, dict[int, Points]]:
     found = {}
     for name, points in _by_method(source).items():
         whole = max(point["n_train"] for point in points)
-        found[name] = _grouped([p for p in points if p["n_train"] == whole], "iterations")
+        curve = _grouped([p for p in points if p["n_train"] == whole], "iterations")
+        found[name] = _with_core_seconds(curve)
     return found
+
+
+def _with_core_seconds(curve: dict[int, Points]) -> dict[int, Points]:
+    """Give trainings on a graphics processor core-seconds, in proportion to the iterations.
+
+    The longest trainings on a processor set the proportion.
+    """
+    most = max(n for n, points in curve.items() if "core_s" in points[0])
+    each = core_seconds(curve[most]) / most
+    return {
+        n: [{"core_s": n * each, "predicted": True, **p} if "gpu_s" in p else p for p in points]
+        for n, points in curve.items()
+    }
 
 
 def error_of(points: Points, part: str = "test") -> float:
@@ -95,7 +109,8 @@ def training_iterations(source: str) -> str:
         first, best = curve[min(curve)], curve[selected]
         relative = float(median(point["test"]["rel_l2_median"] for point in best))
         cells = [f"`{name}`", f"{min(curve):,}", _cell(first), f"{selected:,}", _cell(best)]
-        cells += [number(100 * relative), number(core_seconds(best)), f"{max(curve):,}"]
+        seconds = "≈ " * ("predicted" in best[0]) + number(core_seconds(best))
+        cells += [number(100 * relative), seconds, f"{max(curve):,}"]
         body.append((error_of(best), cells + flatness(list(held_out.values()))))
     headings = ["method", "fewest iterations", "e with them, m", "selected iterations"]
     headings += ["e with them, m", "median %", "core-s", "most iterations", *FLATNESS]
