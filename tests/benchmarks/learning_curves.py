@@ -22,7 +22,7 @@ from pathlib import Path
 from statistics import median
 from threading import Lock
 from time import perf_counter, process_time
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -227,7 +227,7 @@ def main(
     dataset: Annotated[str, typer.Option(help="Name or TOML file.")] = "beam-coarse",
     method: Annotated[list[str], typer.Option(help="One of METHODS.")] = BY_DEFAULT,
     most_core_s: Annotated[float, typer.Option(help="Longest training, core-seconds.")] = 120.0,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Of the trainings.")] = "cpu",
     jobs: Annotated[int, typer.Option(help="Trainings side by side.")] = 1,
     report: Annotated[
         Path,
