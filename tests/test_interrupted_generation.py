@@ -183,10 +183,14 @@ def long_undisturbed(
 def test_a_generation_killed_fifty_times_and_resumed_is_bit_identical(
     tmp_path: Path, generators: Generators, long_undisturbed: dict[str, bytes]
 ) -> None:
-    """Every tenth kill hits a pool of workers. A finished dataset is generated again."""
+    """Every tenth kill hits a pool of workers. A finished dataset is generated again.
+
+    How many of 50 kills hit a write depends on the machine, so it goes on until 10 have hit one.
+    """
     rng = np.random.default_rng(int(time.time()))
     kills = in_a_write = partial = attempt = 0
-    while kills < 50:
+    while kills < 50 or in_a_write < 10 or partial < 25:
+        assert kills < 500
         cache = tmp_path / str(attempt)
         folder = dataset_folder(LONG, cache)
         pool = kills % 10 == 9
@@ -203,8 +207,6 @@ def test_a_generation_killed_fifty_times_and_resumed_is_bit_identical(
             kills += 1
             in_a_write += bool(leftovers(folder))
             partial += 0 < len(shards(folder)) < 158
-    assert in_a_write >= 10
-    assert partial >= 25
     assert generators.wait(generators.start(cache)) == 0
     assert files(folder) == long_undisturbed
     assert not leftovers(folder)
