@@ -37,12 +37,13 @@ def change_of_basis(old: Array, new: Array) -> Array:
     return change
 
 
-def error_weights(displacements: Array) -> Array:
+def error_weights(displacements: Array, smallest: float = SMALLEST) -> Array:
     """Return weights (n_samples,) that make errors relative to displacements (n_samples, n).
 
-    Displacements smaller than `SMALLEST` get the weight of that size.
+    Displacements smaller than a part `smallest` of the root mean square get the weight of that
+    size.
     """
     sizes = np.linalg.norm(displacements, axis=1)
     typical = float(np.sqrt((sizes**2).mean()))
-    weights: Array = typical / np.maximum(sizes, SMALLEST * typical)
+    weights: Array = typical / np.maximum(sizes, smallest * typical)
     return weights

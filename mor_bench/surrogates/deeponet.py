@@ -125,9 +125,8 @@ class DeepONet(OperatorSurrogate):
         Number of functions; with POD, capped at the rank.
     width, depth : int
         Units and number of the hidden layers in branch and trunk.
-    loss : {"absolute", "relative", "auto"}
-        Mean squared error, without or with division by each sample's mean square. "auto" divides
-        for the linear response only.
+    loss : {"relative", "absolute"}
+        Mean relative L2 error of the samples, or mean squared error.
     """
 
     input: Input = "force"
@@ -136,7 +135,7 @@ class DeepONet(OperatorSurrogate):
     n_functions: Annotated[int, Field(ge=1)] = 64
     width: Annotated[int, Field(ge=1)] = 128
     depth: Annotated[int, Field(ge=1)] = 3
-    loss: SampleLoss = "auto"
+    loss: SampleLoss = "relative"
     iterations: Annotated[int, Field(ge=1)] = 20_000
     batch_size: Annotated[int, Field(ge=1)] = 64
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 2e-3

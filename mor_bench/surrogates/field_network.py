@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mor_bench.learning.losses import norms
 from mor_bench.learning.training_plan import Loss, TrainingPlan
 from mor_bench.scene.mesh import Mesh
 from mor_bench.surrogates.field_surrogate import Arrays, FieldSurrogate
 
-SampleLoss = Literal["absolute", "relative", "auto"]
+SampleLoss = Literal["absolute", "relative"]
 
 SECOND_MOMENT_DECAY = 0.99
 """Adam's β₂. A value smaller than Adam's default suits short trainings."""
@@ -50,14 +51,13 @@ class FieldNetwork(nn.Module, ABC):
 class OperatorSurrogate(FieldSurrogate):
     """A `FieldSurrogate` with a `FieldNetwork`.
 
-    The training loss is the mean squared error over the components of all nodes. With the loss
-    "relative", the error of each sample is divided by the sample's mean square. The loss "auto" is
-    "relative" for the linear response and "absolute" for the force. G(0) is subtracted in training
-    too.
+    The training loss is the mean over the samples of the error's L2 norm, divided by that of the
+    displacement, or of its nonlinear remainder. With the loss "absolute", it is the mean squared
+    error over the components of all nodes. G(0) is subtracted in training too.
     """
 
     network_: FieldNetwork
-    loss: SampleLoss = "auto"
+    loss: SampleLoss = "relative"
 
     @abstractmethod
     def build_network(self, constants: Arrays) -> FieldNetwork: ...
@@ -80,10 +80,7 @@ class OperatorSurrogate(FieldSurrogate):
         free = torch.ones(targets.shape[1:])
         free.view(-1)[torch.from_numpy(self.scene_.fixed_dofs)] = 0.0
         free = free.to(targets.device)
-        relative = self.loss == "relative" or (
-            self.loss == "auto" and self.input == "linear-response"
-        )
-        weights = relative_weights(targets) if relative else None
+        weights = relative_weights(targets) if self.loss == "relative" else None
 
         def loss(rows: Tensor) -> Tensor:
             at_rest = rows.new_full((1,), len(targets))
@@ -91,7 +88,7 @@ class OperatorSurrogate(FieldSurrogate):
             errors: Tensor = (answers[:-1] - answers[-1:]) * free - targets[rows]
             if weights is None:
                 return errors.square().mean()
-            return (errors.square().mean(dim=(1, 2)) * weights[rows]).mean()
+            return norms(errors.square().mean(dim=(1, 2)) * weights[rows]).mean()
 
         return loss
 
@@ -119,14 +116,13 @@ class OperatorSurrogate(FieldSurrogate):
 
 
 def relative_weights(targets: Tensor) -> Tensor:
-    """Return weights ~ 1 / mean square of each target (n, n_nodes, 3), (n,), 1 on average.
+    """Return 1 / mean square of each target (n, n_nodes, 3), (n,).
 
     The mean square is at least that of `SMALLEST_SIZE` times the root mean square of all.
     """
     size = targets.square().mean(dim=(1, 2))
     least = max(SMALLEST_SIZE**2 * float(size.mean()), torch.finfo(size.dtype).tiny)
-    weights = 1.0 / size.clamp(min=least)
-    return weights / weights.mean()
+    return 1.0 / size.clamp(min=least)
 
 
 class SelfInitialised(ABC, nn.Module):

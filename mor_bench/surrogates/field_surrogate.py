@@ -59,7 +59,7 @@ class FieldSurrogate(Surrogate, ABC):
     input_scale_, output_scale_ : float
         Divisors of the input, N or m, and of the learned displacement, m.
     loss_curve_ : (n_intervals,) float64
-        Training loss, in units of ``output_scale_`` squared.
+        Training loss; a mean squared error is in units of ``output_scale_`` squared.
     iterations_ : int
         Number of iterations that repeats the training.
     """

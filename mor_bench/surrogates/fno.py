@@ -194,16 +194,15 @@ class FourierNeuralOperator(OperatorSurrogate):
         Channels and number of layers.
     modes : int
         Wave numbers per axis, 0 to modes - 1 and their negatives; axes with fewer keep all.
-    loss : {"absolute", "relative", "auto"}
-        Mean squared error, without or with division by each sample's mean square. "auto" divides
-        for the linear response only.
+    loss : {"relative", "absolute"}
+        Mean relative L2 error of the samples, or mean squared error.
     """
 
     input: Input = "force"
     channels: Annotated[int, Field(ge=1, le=512)] = 20
     modes: Annotated[int, Field(ge=1)] = 6
     layers: Annotated[int, Field(ge=1, le=16)] = 4
-    loss: SampleLoss = "auto"
+    loss: SampleLoss = "relative"
     iterations: Annotated[int, Field(ge=1)] = 2000
     batch_size: Annotated[int, Field(ge=1)] = 32
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3

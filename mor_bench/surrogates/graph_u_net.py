@@ -256,16 +256,15 @@ class MultiScaleGraphNet(OperatorSurrogate):
         Number of coarser graphs.
     steps : int
         Steps of message passing per graph, on the way down and on the way up.
-    loss : {"absolute", "relative", "auto"}
-        Mean squared error, without or with division by each sample's mean square. "auto" divides
-        for the linear response only.
+    loss : {"relative", "absolute"}
+        Mean relative L2 error of the samples, or mean squared error.
     """
 
     input: Input = "force"
     width: Annotated[int, Field(ge=1, le=512)] = 32
     levels: Annotated[int, Field(ge=1, le=8)] = 3
     steps: Annotated[int, Field(ge=1, le=16)] = 2
-    loss: SampleLoss = "auto"
+    loss: SampleLoss = "relative"
     iterations: Annotated[int, Field(ge=1)] = 2000
     batch_size: Annotated[int, Field(ge=1)] = 16
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3

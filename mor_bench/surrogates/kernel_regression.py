@@ -24,8 +24,9 @@ from mor_bench.surrogates.coordinate_regression import (
     Input,
 )
 
-LENGTH_SCALES = {"linear-response": 8.0, "force": 100.0}
-"""Default length scale of kernel ridge regression, by input."""
+LENGTH_SCALES = {"linear-response": 20.0, "force": 100.0}
+"""Default length scale of kernel ridge regression, and start of the search of Gaussian processes,
+by input."""
 
 LENGTHS = (1e-2, 1e3)
 """Bounds on length scales; inputs are of the order of one."""
@@ -164,19 +165,19 @@ class PCAKernelRidge(GaussianSums):
         solves with a dense matrix of this size.
     length_scale : float, optional
         Length scale of the kernel, for coordinates with root mean squares of the order of one.
-        Default: 8 for the linear response and 100 for the force.
+        Default: 20 for the linear response and 100 for the force.
     ridge : float
         Tikhonov weight, relative to the kernel's largest value.
     """
 
     input: Input = "linear-response"
     n_input_modes: Annotated[int, Field(ge=1)] | None = None
-    n_output_modes: Annotated[int, Field(ge=1)] = 40
+    n_output_modes: Annotated[int, Field(ge=1)] = 80
     n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000
     length_scale: Annotated[float, Field(ge=LENGTHS[0], le=LENGTHS[1])] | None = None
-    ridge: Annotated[float, Field(ge=1e-14, allow_inf_nan=False)] = 1e-8
+    ridge: Annotated[float, Field(ge=1e-14, allow_inf_nan=False)] = 1e-11
 
-    usual_inputs: ClassVar = {"linear-response": 20, "force": 200}
+    usual_inputs: ClassVar = {"linear-response": 40, "force": 200}
 
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         from sklearn.kernel_ridge import KernelRidge
@@ -215,9 +216,11 @@ class PCAGaussianProcess(GaussianSums):
 
     input: Input = "linear-response"
     n_input_modes: Annotated[int, Field(ge=1)] | None = None
-    n_output_modes: Annotated[int, Field(ge=1)] = 40
+    n_output_modes: Annotated[int, Field(ge=1)] = 80
     n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000
     n_optimised: Annotated[int, Field(ge=1, le=5000)] = 300
+
+    usual_inputs: ClassVar = {"linear-response": 20, "force": 200}
 
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         from sklearn.exceptions import ConvergenceWarning

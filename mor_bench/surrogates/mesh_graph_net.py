@@ -115,16 +115,15 @@ class MeshGraphNet(OperatorSurrogate):
         Message-passing steps, each with its own weights. The paper uses 15.
     hidden_layers : int
         Hidden layers of each perceptron. The paper uses 2.
-    loss : {"absolute", "relative", "auto"}
-        Mean squared error, without or with division by each sample's mean square. "auto" divides
-        for the linear response only.
+    loss : {"relative", "absolute"}
+        Mean relative L2 error of the samples, or mean squared error.
     """
 
     input: Input = "force"
     width: Annotated[int, Field(ge=1, le=1024)] = 128
     steps: Annotated[int, Field(ge=1, le=64)] = 15
     hidden_layers: Annotated[int, Field(ge=1, le=4)] = 2
-    loss: SampleLoss = "auto"
+    loss: SampleLoss = "relative"
     iterations: Annotated[int, Field(ge=1)] = 1000
     batch_size: Annotated[int, Field(ge=1)] = 8
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3

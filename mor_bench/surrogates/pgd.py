@@ -20,6 +20,7 @@ from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
+from mor_bench.reduction.coordinates import error_weights
 from mor_bench.reduction.separated import Family, Term, separate
 from mor_bench.reduction.subspace import at_wanted, wanted_dofs
 from mor_bench.scene.scene import Scene
@@ -44,9 +45,9 @@ def not_single(plan: AnyLoads) -> str | None:
 FLAT = 1e-6
 """Smallest extent of the load positions along a coordinate axis, relative to the body."""
 
-LEAST_WEIGHED = 0.02
-"""Errors are divided by the load's magnitude, but at least by this fraction of the largest
-magnitude."""
+LEAST_WEIGHED = 0.05
+"""Errors are divided by the displacement's norm, but at least by this fraction of its root mean
+square."""
 
 
 @dataclass(frozen=True)
@@ -171,9 +172,7 @@ class SeparatedLoad(Surrogate):
         largest = float(np.linalg.norm(vectors, axis=1).max())
         model = {"frame": frame, "ends": ends, "largest": np.array([largest])}
         position, directions, powers = self._functions_of(model)(positions, vectors)
-        # Errors are relative to the load, so small loads are fitted too.
-        magnitude = np.linalg.norm(vectors, axis=1) / (largest or 1.0)
-        weights = 1.0 / np.maximum(magnitude, LEAST_WEIGHED)
+        weights = error_weights(samples.free_displacements, LEAST_WEIGHED)
         families: list[Family] = [
             (position, directions[degree], powers[:, degree - 1 :: 2] * weights[:, None])
             for degree in self._degrees

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -11,9 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
+from scipy.linalg import solve
 from torch import Tensor
 
 from mor_bench.counting import count
+from mor_bench.learning.losses import norms
 from mor_bench.learning.perceptron import (
     Perceptron,
     evaluate,
@@ -27,21 +29,25 @@ from mor_bench.learning.perceptron import (
 from mor_bench.learning.training_plan import Loss
 from mor_bench.model_file import fitting_arrays, weights_to_start_from
 from mor_bench.reduction.coordinates import change_of_basis
-from mor_bench.surrogates.coordinate_regression import Array, CoordinateSamples, Input
+from mor_bench.surrogates.coordinate_regression import Array, Arrays, CoordinateSamples, Input
 from mor_bench.surrogates.network_regression import NetworkRegression
 
 DERIVATIVE_WEIGHT = 0.1
 """Weight of the squared error of a sample's derivatives relative to its displacement's."""
 
+RIDGE = 1e-6
+"""Tikhonov weight of A, relative to the mean square of the coordinates."""
+
 
 @dataclass(eq=False)
 class PODNN(NetworkRegression):
-    """g(z) = N(z) - N(0) - N′(0) z of the linear response, g(z) = N(z) - N(0) of the force.
+    """g(z) = N(z) - N(0) - N′(0) z of the linear response, g(z) = A z + N(z) - N(0) of the force.
 
     Hesthaven, Ubbiali: Non-intrusive reduced order modeling of nonlinear problems using neural
     networks, Journal of Computational Physics 363 (2018). With the linear response as input, the
-    learned remainder is of second order in the load, so value and slope at rest are subtracted. See
-    also `CoordinateRegression`.
+    learned remainder is of second order in the load, so value and slope at rest are subtracted.
+    With the force as input, A is fitted first by ridge regression, and N learns what it leaves. The
+    loss is the mean relative L2 error. See also `CoordinateRegression`.
 
     With derivatives the network also matches those of the displacement with respect to the load,
     see `mor_bench.reduction.sensitivity`; after O'Leary-Roseberry et al.: Derivative-informed
@@ -79,7 +85,20 @@ class PODNN(NetworkRegression):
     def networks(self, n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, int, int]]:
         return dict.fromkeys(self.names, (n_inputs, self.n_hidden, n_outputs))
 
+    def shapes(
+        self, model: Arrays, n_inputs: int, n_outputs: int
+    ) -> Mapping[str, tuple[int | None, ...]]:
+        linear = {"linear": (self.axes_.shape[1], n_outputs)} if self.input == "force" else {}
+        return {**super().shapes(model, n_inputs, n_outputs), **linear}
+
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
+        if self.input == "linear-response":
+            return self._trained(samples)
+        linear = _linear_map(samples, self.axes_.shape[1])
+        return {"linear": linear, **self._trained(_without(samples, linear))}
+
+    def _trained(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
+        """Train the networks; return their arrays."""
         scale = float(np.sqrt((samples.values**2).sum(axis=1).mean()))
         arrays = {
             "inputs": samples.z,
@@ -141,11 +160,13 @@ class PODNN(NetworkRegression):
             """Return the sum over the networks; Adam steps each weight alone."""
             x, weight = z[rows], weights[rows]
             if known is None:
-                return ((remainder(x) - wanted[rows]) * weight).square().sum() / len(rows)
-            found, slopes = derivatives(x, known[rows])
-            values = ((found - wanted[rows]) * weight).square().sum()
-            wrong = (slopes - data["slopes"][rows]) * weight[:, None]
-            return (values + DERIVATIVE_WEIGHT * wrong.square().sum()) / len(rows)
+                squares = ((remainder(x) - wanted[rows]) * weight).square().sum(dim=-1)
+            else:
+                found, slopes = derivatives(x, known[rows])
+                squares = ((found - wanted[rows]) * weight).square().sum(dim=-1)
+                wrong = (slopes - data["slopes"][rows]) * weight[:, None]
+                squares = squares + DERIVATIVE_WEIGHT * wrong.square().sum(dim=(-2, -1))
+            return norms(squares).sum() / len(rows)
 
         return loss
 
@@ -155,6 +176,7 @@ class PODNN(NetworkRegression):
         if self.input == "linear-response":
             self._slopes = np.array([slope_at_rest(w) for w in self.networks_.values()])
             self._slope = self._slopes.mean(axis=0)
+        self._linear = model.get("linear")
 
     def values(self, z: Array) -> Array:
         return evaluate(self.networks_["network"], z)
@@ -164,7 +186,27 @@ class PODNN(NetworkRegression):
         if self._slope is not None:
             count(multiply_adds=len(z) * self._slope.size)
             out -= z @ self._slope
+        if self._linear is not None:
+            count(multiply_adds=len(z) * self._linear.size)
+            out += z[:, : len(self._linear)] @ self._linear
         return out
+
+
+def _linear_map(samples: CoordinateSamples, n_inputs: int) -> Array:
+    """Fit A (n_inputs, n_outputs) by ridge regression; errors are relative."""
+    z = samples.z[:, :n_inputs] * samples.weights
+    gram = z.T @ z
+    gram[np.diag_indices(n_inputs)] += RIDGE * gram.trace() / n_inputs
+    return np.asarray(solve(gram, z.T @ (samples.values * samples.weights), assume_a="pos"))
+
+
+def _without(samples: CoordinateSamples, linear: Array) -> CoordinateSamples:
+    """Return samples whose values are without those of a linear map (n_inputs, n_outputs)."""
+    n_inputs = len(linear)
+    slopes = samples.slopes
+    if samples.directions is not None and slopes is not None:
+        slopes = slopes - samples.directions[..., :n_inputs] @ linear
+    return replace(samples, values=samples.values - samples.z[:, :n_inputs] @ linear, slopes=slopes)
 
 
 @dataclass(eq=False)
@@ -214,7 +256,9 @@ class PODNNEnsemble(PODNN):
     def _members(self, z: Array) -> Array:
         """Return g of each member at z (n, n_inputs), as (n_members, n, n_outputs)."""
         members = np.asarray((self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last)
-        return members if self._slope is None else members - z @ self._slopes
+        if self._linear is not None:
+            return members + z[:, : len(self._linear)] @ self._linear
+        return members - z @ self._slopes
 
     def _hidden(self, z: Array) -> Array:
         """Return the last hidden layers at z (n, n_inputs), (n_members, n, n_hidden)."""

@@ -171,9 +171,8 @@ class Transolver(OperatorSurrogate):
         Blocks, each with its own weights.
     mlp_ratio : int
         Hidden units of the perceptron of a block, relative to `width`.
-    loss : {"absolute", "relative", "auto"}
-        Mean squared error, without or with division by each sample's mean square. "auto" divides
-        for the linear response only.
+    loss : {"relative", "absolute"}
+        Mean relative L2 error of the samples, or mean squared error.
     """
 
     input: Input = "force"
@@ -182,7 +181,7 @@ class Transolver(OperatorSurrogate):
     slices: Annotated[int, Field(ge=1, le=1024)] = 32
     layers: Annotated[int, Field(ge=1, le=64)] = 1
     mlp_ratio: Annotated[int, Field(ge=1, le=16)] = 2
-    loss: SampleLoss = "auto"
+    loss: SampleLoss = "relative"
     iterations: Annotated[int, Field(ge=1)] = 8000
     batch_size: Annotated[int, Field(ge=1)] = 8
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3
