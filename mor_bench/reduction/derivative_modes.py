@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.basis import pod
+from mor_bench.reduction.static_correction import LINEAR_WEIGHT
 from mor_bench.scene.scene import Scene
 from mor_bench.specs.load_ranges import largest_of
 
@@ -106,7 +107,8 @@ def derivative_basis(
 
     The derivatives are those of the first n_linear modes. All enter one singular value
     decomposition, scaled as in the second-order expansion u = Σ qᵢφᵢ + ½ Σ qᵢqⱼψᵢⱼ. The coordinates
-    there have their root mean square.
+    there have their root mean square. Static correction supplies the linear part, so the linear
+    modes have the weight `LINEAR_WEIGHT`.
     """
     linear = linear_modes(scene, model)
     n_linear = min(n_linear, linear.modes.shape[1])
@@ -115,5 +117,5 @@ def derivative_basis(
     bent = modal_derivatives(model, linear.modes[:, :n_linear]) * (
         halves * amplitudes[first] * amplitudes[second]
     )
-    straight = (linear.modes * amplitudes).T[: max(n_linear, n_modes)]
+    straight = LINEAR_WEIGHT * (linear.modes * amplitudes).T[: max(n_linear, n_modes)]
     return pod(np.vstack([straight, bent.T]), n_modes).modes

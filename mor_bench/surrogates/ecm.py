@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.reduction.cubature import ecsw_system
+from mor_bench.reduction.cubature import ecsw_system, triangle
 from mor_bench.reduction.empirical_cubature import empirical_cubature
 from mor_bench.surrogates.cubature_states import States
-from mor_bench.surrogates.hyper_reduced import CubatureSurrogate
+from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced_points
 
 Array = NDArray[np.float64]
 
@@ -22,9 +22,19 @@ class EmpiricalCubaturePOD(CubatureSurrogate):
 
     ``cubature_tolerance`` is the fraction of the reduced cell forces that the basis may miss, in
     the Frobenius norm over cells, snapshots and modes; 0 keeps every cell with weight 1
-    (Hernández, Caicedo, Ferrer 2017). The weights sum to the number of cells. The other parameters
-    are those of `CubatureSurrogate`.
+    (Hernández, Caicedo, Ferrer 2017). The weights sum to the number of cells.
+
+    Parameters
+    ----------
+    n_modes, cubature_tolerance, n_cubature_snapshots, tolerance, matching, static_correction
+        See `CubatureSurrogate`.
+    sampling : {"cells", "points"}
+        "cells": integrate every point of a chosen cell, as Kratos does. "points": a second cubature
+        to the same tolerance keeps few points of these cells, each with its own weight. Then
+        positive det F is checked at these points only.
     """
+
+    sampling: Literal["cells", "points"] = "cells"
 
     def choose_cells(
         self, states: States, modes: Array, tolerance: float
@@ -34,4 +44,12 @@ class EmpiricalCubaturePOD(CubatureSurrogate):
             ecsw_system(model.assembler, model.cell_dofs, modes, q), tolerance
         ).weights
         cells = np.flatnonzero(weights)
-        return {"cells": cells, "weights": weights[cells]}
+        weights = weights[cells]
+        if self.sampling == "cells":
+            return {"cells": cells, "weights": weights}
+        points = reduced_points(model.scene, cells, weights, nodal(model.scene, modes))
+        forces = np.concatenate([points.point_forces(row).T for row in q])
+        system = triangle(forces) if len(forces) > 4 * forces.shape[1] else forces
+        factors = empirical_cubature(system, tolerance).weights.reshape(len(cells), -1)
+        used = factors.any(axis=1)
+        return {"cells": cells[used], "weights": factors[used] * weights[used, None]}

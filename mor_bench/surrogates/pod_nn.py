@@ -255,10 +255,12 @@ class PODNNEnsemble(PODNN):
 
     def _members(self, z: Array) -> Array:
         """Return g of each member at z (n, n_inputs), as (n_members, n, n_outputs)."""
-        members = np.asarray((self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last)
+        members: Array = (self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last
         if self._linear is not None:
-            return members + z[:, : len(self._linear)] @ self._linear
-        return members - z @ self._slopes
+            members += z[:, : len(self._linear)] @ self._linear
+        if self._slope is not None:
+            members -= z @ self._slopes
+        return members
 
     def _hidden(self, z: Array) -> Array:
         """Return the last hidden layers at z (n, n_inputs), (n_members, n, n_hidden)."""

@@ -35,7 +35,7 @@ class QuadraticManifoldPOD(CurvedPOD):
     """
 
     n_latent: Annotated[int, Field(ge=1)] = 10
-    n_secondary: Annotated[int, Field(ge=1)] = 40
+    n_secondary: Annotated[int, Field(ge=1)] = 100
     static_correction: bool = True
     cubature_tolerance: Annotated[float, Field(ge=0, lt=1)] = 1e-3
     n_cubature_snapshots: Annotated[int, Field(ge=1)] = 300
