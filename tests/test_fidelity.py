@@ -115,9 +115,8 @@ def test_forces_keep_their_sum_and_moment_on_the_coarse_mesh(element: str) -> No
 
 
 def test_coarse_fem_equals_the_coarse_model_at_shared_nodes(tiny: Dataset) -> None:
-    method = mor_bench.load_method("fem-coarse", coarsening=2, tolerance=1e-10).fit(
-        tiny.scene, None
-    )
+    knobs = {"coarsening": 2, "tolerance": 1e-10, "static_correction": False}
+    method = mor_bench.load_method("fem-coarse", **knobs).fit(tiny.scene, None)
     mesh = with_cells(tiny.scene, (3, 1, 1))
     force = np.zeros((mesh.mesh.n_nodes, 3))
     force[-1] = [0.0, 0.1, -0.5]
@@ -131,6 +130,28 @@ def test_coarse_fem_equals_the_coarse_model_at_shared_nodes(tiny: Dataset) -> No
         FullOrderModel(mesh).solve(force.ravel()[mesh.free_dofs]).displacement
     )
     np.testing.assert_allclose(method.predict(fine)[at], expected.reshape(-1, 3), rtol=0, atol=1e-9)
+
+
+def test_static_correction_leaves_the_coarse_mesh_the_nonlinear_part_only(tiny: Dataset) -> None:
+    model, forces = FullOrderModel(tiny.scene), tiny.test.forces[:20]
+    plain, corrected = (
+        mor_bench.load_method("fem-coarse", static_correction=chosen).fit(tiny.scene, None)
+        for chosen in (False, True)
+    )
+    truth = tiny.test.displacements[:20]
+
+    def errors(method: Any) -> Any:
+        apart = np.linalg.norm(method.predict(forces) - truth, axis=(1, 2))
+        return apart / np.linalg.norm(truth, axis=(1, 2))
+
+    assert errors(corrected).max() < 0.2 * errors(plain).min()
+    small = 1e-4 * forces
+    free = small.reshape(len(small), -1)[:, tiny.scene.free_dofs]
+    linear = tiny.scene.at_all_dofs(model.rest_factor.solve(free.T).T).reshape(small.shape)
+    apart = np.linalg.norm(corrected.predict(small) - linear, axis=(1, 2))
+    assert (apart < 1e-4 * np.linalg.norm(linear, axis=(1, 2))).all()
+    rest = np.zeros((1, *forces.shape[1:]))
+    assert not corrected.predict(rest).any()
 
 
 def box(**changes: Any) -> Scene:

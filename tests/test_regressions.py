@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 INPUTS = ("linear-response", "force")
 FAMILIES: dict[str, dict[str, Any]] = {
     "pca-ridge": {},
-    "pca-kernel-ridge": {"n_points": 100},
+    "pca-kernel-ridge": {"n_points": 100, "ridge": 1e-8},
     "pca-gaussian-process": {"n_points": 100, "n_optimised": 50},
     "pca-random-forest": {"n_trees": 4},
     "pca-extra-trees": {"n_trees": 4},
@@ -47,7 +47,9 @@ def fitted(request: pytest.FixtureRequest, tiny: Dataset) -> Any:
 def models(tiny: Dataset) -> dict[str, Any]:
     """A model of each family from few samples."""
     return {
-        name: mor_bench.load_method(name, **knobs).fit(tiny.scene, tiny.train[:40])
+        name: mor_bench.load_method(name, n_input_modes=20, **knobs).fit(
+            tiny.scene, tiny.train[:40]
+        )
         for name, knobs in FAMILIES.items()
     }
 

@@ -174,7 +174,7 @@ RESTING = {
         ("deim", HPOD | {"sampling": "cells", "n_force_modes": 80}, {}),
         ("local-pod", {"n_clusters": 1, "n_modes": 20}, {}),
         ("local-pod", {"n_clusters": 2, "n_modes": 10}, {"material": POLYNOMIAL}),
-        ("quadratic-manifold-pod", {"n_latent": 20}, {}),
+        ("quadratic-manifold-pod", {"n_latent": 20, "n_secondary": 40}, {}),
         ("modal-derivatives", {"n_linear": 5, "n_modes": 20}, {}),
         ("quadratic-manifold", {"n_modes": 5}, {}),
     ],

@@ -24,9 +24,12 @@ from mor_bench.surrogates.coordinate_regression import (
     Input,
 )
 
-LENGTH_SCALES = {"linear-response": 20.0, "force": 100.0}
-"""Default length scale of kernel ridge regression, and start of the search of Gaussian processes,
-by input."""
+LENGTH_SCALES = {"linear-response": 12.0, "force": 100.0}
+"""Default length scale of kernel ridge regression, by input."""
+
+FIRST_LENGTHS = {"linear-response": 8.0, "force": 100.0}
+"""Where a Gaussian process begins to search its length scales. From a longer one it may end at no
+correlation."""
 
 LENGTHS = (1e-2, 1e3)
 """Bounds on length scales; inputs are of the order of one."""
@@ -165,7 +168,7 @@ class PCAKernelRidge(GaussianSums):
         solves with a dense matrix of this size.
     length_scale : float, optional
         Length scale of the kernel, for coordinates with root mean squares of the order of one.
-        Default: 20 for the linear response and 100 for the force.
+        Default: 12 for the linear response and 100 for the force.
     ridge : float
         Tikhonov weight, relative to the kernel's largest value.
     """
@@ -175,7 +178,7 @@ class PCAKernelRidge(GaussianSums):
     n_output_modes: Annotated[int, Field(ge=1)] = 80
     n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000
     length_scale: Annotated[float, Field(ge=LENGTHS[0], le=LENGTHS[1])] | None = None
-    ridge: Annotated[float, Field(ge=1e-14, allow_inf_nan=False)] = 1e-11
+    ridge: Annotated[float, Field(ge=1e-14, allow_inf_nan=False)] = 1e-9
 
     usual_inputs: ClassVar = {"linear-response": 40, "force": 200}
 
@@ -229,7 +232,7 @@ class PCAGaussianProcess(GaussianSums):
 
         z, targets = samples.z[: self.n_points], samples.values[: self.n_points]
         scale = float(np.sqrt((targets**2).mean(axis=0).max()))
-        start = np.full(z.shape[1], LENGTH_SCALES[self.input])
+        start = np.full(z.shape[1], FIRST_LENGTHS[self.input])
         kernel = ConstantKernel(100.0, (1e-4, 1e8)) * RBF(start, LENGTHS) + WhiteKernel(
             1e-5, (LEAST_NOISE, 1e1)
         )
