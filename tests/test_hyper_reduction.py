@@ -115,11 +115,28 @@ def test_hyper_reduction_works_for_every_law_and_element(law: str, kind: tuple[s
     fewer = HyperReducedPOD(5, 1e-3, sampling="points").fit(scene, train)
     assert fewer.problem_.points.n_points < few.problem_.points.n_points or kind[0] == "tetrahedron"
     greedy = EmpiricalCubaturePOD(5, 1e-2).fit(scene, train)
+    least = EmpiricalCubaturePOD(5, 5e-3, sampling="points").fit(scene, train)
+    assert (
+        least.problem_.points.n_points < greedy.problem_.points.n_points or kind[0] == "tetrahedron"
+    )
     # Fibres carry load in tension alone: forces with such a kink take more modes.
     sampled = InterpolatedPOD(5, 16 if law == "holzapfel-gasser-ogden" else 8).fit(scene, train)
-    for method in (few, fewer, greedy, sampled):
+    for method in (few, fewer, greedy, least, sampled):
         assert len(method.cells_) < scene.mesh.n_cells
         assert np.abs(method.predict(train.forces) - plain).max() <= 0.03 * size
+
+
+def test_empirical_cubature_of_points_keeps_few_points_of_few_cells(tiny: Dataset) -> None:
+    cells, points = (
+        EmpiricalCubaturePOD(8, 1e-2, sampling=kind).fit(tiny.scene, tiny.train)
+        for kind in ("cells", "points")
+    )
+    assert points.problem_.points.n_points < 0.5 * cells.problem_.points.n_points
+    forces = tiny.test.forces[:20]
+    plain = PODGalerkin(8).fit(tiny.scene, tiny.train).predict(forces)
+    for method in (cells, points):
+        apart = np.linalg.norm(method.predict(forces) - plain, axis=(1, 2))
+        assert np.median(apart / np.linalg.norm(plain, axis=(1, 2))) < 0.03
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 3.0, 100.0])
