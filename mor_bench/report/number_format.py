@@ -40,7 +40,7 @@ MEANINGS = {
     "n_terms": "number of separated terms",
     "max_terms": "largest number of terms",
     "position_degree": "polynomial degree in the position of the load",
-    "static_correction": "linear answer to what the modes leave of the load",
+    "static_correction": "linear answer to what the reduced model leaves of the load",
 }
 """Meanings of the suite's swept parameters with short names."""
 
