@@ -345,7 +345,12 @@ def ecsw_system(
         forces = assembler.cell_forces(modes @ coordinates)
         system[used : used + r] = np.matmul(forces[:, None], local)[:, 0].T
         used += r
-    return triangle(system[:used]) if used > 4 * n_cells else system[:used]
+    return short(system[:used])
+
+
+def short(system: Array) -> Array:
+    """Return a matrix with the same least-squares problem; QR pays above 4 rows per column."""
+    return triangle(system) if len(system) > 4 * system.shape[1] else system
 
 
 def triangle(matrix: Array) -> Array:

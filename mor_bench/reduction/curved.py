@@ -17,7 +17,7 @@ from mor_bench.counting import count
 from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.reduction.cubature import MAX_ENTRIES, triangle
+from mor_bench.reduction.cubature import MAX_ENTRIES, short, triangle
 from mor_bench.reduction.derivative_modes import pairs
 from mor_bench.reduction.galerkin import DenseProblem, GalerkinProblem, stiffness_times
 
@@ -212,4 +212,4 @@ def curved_system(model: FullOrderModel, modes: Array, states: list[tuple[Array,
             rows = [triangle(np.concatenate(rows))]
             used = len(rows[0])
     system = np.concatenate(rows)
-    return triangle(system) if len(system) > 4 * n_cells else system
+    return short(system)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.reduction.cubature import ecsw_system, triangle
+from mor_bench.reduction.cubature import ecsw_system, short
 from mor_bench.reduction.empirical_cubature import empirical_cubature
 from mor_bench.surrogates.cubature_states import States
 from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced_points
@@ -49,7 +49,6 @@ class EmpiricalCubaturePOD(CubatureSurrogate):
             return {"cells": cells, "weights": weights}
         points = reduced_points(model.scene, cells, weights, nodal(model.scene, modes))
         forces = np.concatenate([points.point_forces(row).T for row in q])
-        system = triangle(forces) if len(forces) > 4 * forces.shape[1] else forces
-        factors = empirical_cubature(system, tolerance).weights.reshape(len(cells), -1)
+        factors = empirical_cubature(short(forces), tolerance).weights.reshape(len(cells), -1)
         used = factors.any(axis=1)
         return {"cells": cells[used], "weights": factors[used] * weights[used, None]}

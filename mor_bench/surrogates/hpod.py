@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mor_bench.mechanics.elements import GAUSS
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.reduction.cubature import ecsw_system, sparse_nnls, triangle
+from mor_bench.reduction.cubature import ecsw_system, short, sparse_nnls, triangle
 from mor_bench.reduction.moved_points import PointRule, move_points
 from mor_bench.scene.scene import Scene
 from mor_bench.surrogates.cubature_states import States
@@ -59,7 +59,7 @@ class HyperReducedPOD(CubatureSurrogate):
         self, states: States, modes: Array, tolerance: float
     ) -> dict[str, NDArray[Any]]:
         systems = [ecsw_system(m.assembler, m.cell_dofs, modes, q) for m, q in states()]
-        system = systems[0] if len(systems) == 1 else _short(np.concatenate(systems))
+        system = systems[0] if len(systems) == 1 else short(np.concatenate(systems))
         weights = sparse_nnls(system, system.sum(axis=1), tolerance).weights
         cells = np.flatnonzero(weights)
         if self.sampling == "cells":
@@ -101,8 +101,3 @@ def _forces(model: FullOrderModel, modes: Array, q: Array) -> Array:
     """Return the reduced forces of states (n, r) without springs, which no cubature replaces."""
     forces = np.array([modes.T @ model.force(modes @ row).force for row in q])
     return forces if model.springs is None else forces - q @ (modes.T @ (model.springs @ modes))
-
-
-def _short(system: Array) -> Array:
-    """Return a matrix with the same least-squares problem; QR pays above 4 rows per column."""
-    return triangle(system) if len(system) > 4 * system.shape[1] else system

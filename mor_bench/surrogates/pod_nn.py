@@ -88,13 +88,13 @@ class PODNN(NetworkRegression):
     def shapes(
         self, model: Arrays, n_inputs: int, n_outputs: int
     ) -> Mapping[str, tuple[int | None, ...]]:
-        linear = {"linear": (self.axes_.shape[1], n_outputs)} if self.input == "force" else {}
+        linear = {"linear": (n_inputs, n_outputs)} if self.input == "force" else {}
         return {**super().shapes(model, n_inputs, n_outputs), **linear}
 
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         if self.input == "linear-response":
             return self._trained(samples)
-        linear = _linear_map(samples, self.axes_.shape[1])
+        linear = _linear_map(samples)
         return {"linear": linear, **self._trained(_without(samples, linear))}
 
     def _trained(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
@@ -188,25 +188,24 @@ class PODNN(NetworkRegression):
             out -= z @ self._slope
         if self._linear is not None:
             count(multiply_adds=len(z) * self._linear.size)
-            out += z[:, : len(self._linear)] @ self._linear
+            out += z @ self._linear
         return out
 
 
-def _linear_map(samples: CoordinateSamples, n_inputs: int) -> Array:
+def _linear_map(samples: CoordinateSamples) -> Array:
     """Fit A (n_inputs, n_outputs) by ridge regression; errors are relative."""
-    z = samples.z[:, :n_inputs] * samples.weights
+    z = samples.z * samples.weights
     gram = z.T @ z
-    gram[np.diag_indices(n_inputs)] += RIDGE * gram.trace() / n_inputs
+    gram[np.diag_indices(len(gram))] += RIDGE * gram.trace() / len(gram)
     return np.asarray(solve(gram, z.T @ (samples.values * samples.weights), assume_a="pos"))
 
 
 def _without(samples: CoordinateSamples, linear: Array) -> CoordinateSamples:
     """Return samples whose values are without those of a linear map (n_inputs, n_outputs)."""
-    n_inputs = len(linear)
     slopes = samples.slopes
     if samples.directions is not None and slopes is not None:
-        slopes = slopes - samples.directions[..., :n_inputs] @ linear
-    return replace(samples, values=samples.values - samples.z[:, :n_inputs] @ linear, slopes=slopes)
+        slopes = slopes - samples.directions @ linear
+    return replace(samples, values=samples.values - samples.z @ linear, slopes=slopes)
 
 
 @dataclass(eq=False)
@@ -257,7 +256,7 @@ class PODNNEnsemble(PODNN):
         """Return g of each member at z (n, n_inputs), as (n_members, n, n_outputs)."""
         members: Array = (self._hidden(z) - self._hidden(0.0 * z[:1])) @ self._last
         if self._linear is not None:
-            members += z[:, : len(self._linear)] @ self._linear
+            members += z @ self._linear
         if self._slope is not None:
             members -= z @ self._slopes
         return members
