@@ -36,7 +36,10 @@ Parameters = dict[str, Any]
 CHANNELS, ITERATIONS, BATCH = 8, 1000, 32
 """Size of the U-Meshes, number of iterations, and samples of a batch."""
 
-BASE: Parameters = {"channels": CHANNELS, "iterations": ITERATIONS}
+PUBLISHED: Parameters = {"activation": "relu", "zero_at_rest": False, "loss": "absolute"}
+"""Parameters in which `umesh-small` differs from the published network and its loss."""
+
+BASE: Parameters = {**PUBLISHED, "channels": CHANNELS, "iterations": ITERATIONS}
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,7 @@ def _same_samples(parameters: Parameters) -> Parameters:
 
 
 def changes() -> list[Variant]:
-    """Return the steps from `umesh-small` to `umesh-linear`; each adds to those before it."""
+    """Return the steps from the published network to `umesh-linear`; each adds to those before it."""
     steps: list[tuple[str, Parameters]] = [
         ("force in, displacement out", {}),
         ("+ linear response in, remainder out", {"input": "linear-response"}),

@@ -28,7 +28,7 @@ from mor_bench.machine import pinned_threads
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.training_options import TrainingOptions
-from tests.benchmarks.choices import scored
+from tests.benchmarks.choices import PUBLISHED, scored
 
 ITERATIONS = (780, 1560, 3125, 6250, 12_500)
 """With batches of 32, the last number shows as many samples as the paper's 100,000 batches of 4."""
@@ -178,7 +178,7 @@ def trained(data: Dataset, size: Size, checkpoint: Path) -> dict[str, Any]:
     """
     channels, steps, iterations = size
     method = mor_bench.load_method(
-        "umesh-small", channels=channels, steps=steps, iterations=iterations
+        "umesh-small", channels=channels, steps=steps, iterations=iterations, **PUBLISHED
     )
     method.training = TrainingOptions(checkpoint=checkpoint)
     with pinned_threads(1):
