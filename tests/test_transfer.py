@@ -127,8 +127,8 @@ def test_every_trained_method_names_its_architecture() -> None:
         ("pod-nn", "input", "linear-response"),
         ("pod-nn", "n_hidden", 8),
         ("umesh-small", "input", "linear-response"),
-        ("umesh-small", "activation", "silu"),
-        ("umesh-small", "zero_at_rest", True),
+        ("umesh-small", "activation", "relu"),
+        ("umesh-small", "zero_at_rest", False),
         ("umesh-small", "normalisation", "max"),
         ("umesh-small", "steps", 2),
     ],
@@ -148,12 +148,12 @@ def test_another_architecture_is_refused_before_anything_runs(
     files: dict[str, Path], tmp_path: Path
 ) -> None:
     with pytest.raises(
-        InvalidInputError, match=r"`activation` 'silu'.*; got one with .*`activation` 'relu'"
+        InvalidInputError, match=r"`activation` 'relu'.*; got one with .*`activation` 'silu'"
     ):
         mor_bench.fit(
             "beam-tiny",
             "umesh-linear",
-            {"channels": 2, "steps": 1},
+            {"channels": 2, "steps": 1, "activation": "relu"},
             out=tmp_path / "a",
             start_from=files["umesh-small"],
             cache=tmp_path / "cache",
