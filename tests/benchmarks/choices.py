@@ -121,7 +121,7 @@ def _same_samples(parameters: Parameters) -> Parameters:
 
 
 def changes() -> list[Variant]:
-    """Return the steps from the published network to `umesh-linear`; each adds to those before it."""
+    """Return the steps from the published network to `umesh-linear`, each with those before it."""
     steps: list[tuple[str, Parameters]] = [
         ("force in, displacement out", {}),
         ("+ linear response in, remainder out", {"input": "linear-response"}),

@@ -9,7 +9,8 @@ trainings. The regression has another name today, which says what it is told. Hy
 without static correction, which the earlier version lacks.
 
 Two more runs have methods of today that the first two leave out. Scenes of a run that the file has
-already are not repeated, so that the same command continues after an interruption.
+already are not repeated, so that the same command continues after an interruption. `--newest` has
+the newest contestants instead, beside the full-order model.
 """
 
 from __future__ import annotations
@@ -64,6 +65,12 @@ FURTHER = (
     "autoencoder",
     "pod-deeponet[input=linear-response]",
 )
+NEWEST = (
+    "fem",
+    "ecm[sampling=points,static_correction=true]",
+    "fem-coarse[static_correction=true]",
+    "hybrid",
+)
 
 TEST_SETS = re.compile(r"^\[tests\]\n(?:[^\[\n].*\n|\n)*", re.MULTILINE)
 ERRORS = ("rel_l2_median", "rel_l2_p95", "rel_l2_max")
@@ -100,6 +107,7 @@ def rows_of(
 def main(
     commit: Annotated[str, typer.Argument(help="The earlier commit.")],
     limit: Annotated[int, typer.Option(help="Samples of each scene.")] = 400,
+    newest: Annotated[bool, typer.Option("--newest", help="Run the newest methods only.")] = False,
     report: Annotated[
         Path, typer.Option("--json", metavar="FILE", help="Write the rows here.")
     ] = Path("fronts.json"),
@@ -122,6 +130,8 @@ def main(
                 "more": (ROOT, MORE),
                 "further": (ROOT, FURTHER),
             }
+            if newest:
+                runs = {"newest": (ROOT, NEWEST)}
             for name, (code, methods) in runs.items():
                 rows = found.get(name, [])
                 measured = {row["dataset"] for row in rows}

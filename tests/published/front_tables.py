@@ -42,21 +42,29 @@ def rows_of_today(content: Mapping[str, Any]) -> list[dict[str, Any]]:
 def fronts(source: str) -> str:
     """Show the fastest time for each error and the least error in each time, before and now."""
     content = content_of(source)
-    body = []
-    for scene in scenes_of(content["now"]):
-        before, now = (_figures(points_on(scene, content[code])) for code in ("before", "now"))
-        cells = (f"{old} → {_with_method(new)}" for (old, _), new in zip(before, now, strict=True))
-        body.append([scene, *cells])
-    return markdown(HEADINGS, body)
+    return _both(content["before"], content["now"])
 
 
 def fronts_of_all(source: str) -> str:
     """Show the fastest time for each error and the least error in each time, of today's methods."""
-    content = content_of(source)
-    rows = rows_of_today(content)
+    rows = rows_of_today(content_of(source))
     body = [
         [scene, *map(_with_method, _figures(points_on(scene, rows)))] for scene in scenes_of(rows)
     ]
+    return markdown(HEADINGS, body)
+
+
+def fronts_of_newest(source: str) -> str:
+    """Show the same figures of the full-order model alone, and with the newest methods."""
+    rows = content_of(source)["newest"]
+    return _both([row for row in rows if row["method"] == "fem"], rows)
+
+
+def _both(old: Sequence[Mapping[str, Any]], new: Sequence[Mapping[str, Any]]) -> str:
+    body = []
+    for scene in scenes_of(new):
+        pairs = zip(*(_figures(points_on(scene, rows)) for rows in (old, new)), strict=True)
+        body.append([scene, *(f"{left} → {_with_method(right)}" for (left, _), right in pairs)])
     return markdown(HEADINGS, body)
 
 

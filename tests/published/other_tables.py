@@ -23,7 +23,7 @@ from tests.published.cost_tables import (
     probe_cost,
     scaling,
 )
-from tests.published.front_tables import fronts, fronts_of_all, nothing_slower
+from tests.published.front_tables import fronts, fronts_of_all, fronts_of_newest, nothing_slower
 from tests.published.literature_table import literature
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
@@ -364,6 +364,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "network-size-law": network_size_tables.network_size_law,
     "fronts": fronts,
     "fronts-of-all": fronts_of_all,
+    "fronts-of-newest": fronts_of_newest,
     "nothing-slower": nothing_slower,
     "stresses": stresses,
     "full-sizes": network_size_tables.full_sizes,
