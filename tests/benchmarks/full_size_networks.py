@@ -37,6 +37,7 @@ from mor_bench.specs import load_dataset_spec
 from mor_bench.specs.inline_parameters import split_method
 from mor_bench.surrogates.field_network import FieldNetwork, OperatorSurrogate
 from mor_bench.training_options import TrainingOptions
+from tests.benchmarks.choices import PUBLISHED
 
 AT_THE_PAPERS_DEFORMATION = {
     name if name == "liver-tet" else f"{name}-paper": scene for name, scene in SCENES.items()
@@ -61,12 +62,12 @@ OTHERS: dict[str, dict[str, Any]] = {
         "batch_size": 4,
         "learning_rate": 1e-3,
     },
-    "umesh-small": {"inference": "cuda"},
+    "umesh-small": {**PUBLISHED, "inference": "cuda"},
 }
 """Other networks from the force, in the sizes of their authors or of their authors' code.
 
 `graph-u-net` has the width of the other graph network, and the levels of its file. `umesh-small`
-has the size of its file.
+has the size of its file, with the paper's loss and activation.
 """
 
 EXTRA_SEED = 1

@@ -207,15 +207,17 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     headings = ["method", "is given", *(f"≤ {number(100 * level)} %" for level in LEVELS)]
     body, bounds = [], error_bounds(run, name)
     for method, rows in _by_method(rows_of(run, dataset, methods)).items():
-        cells = [f"`{method}`", class_text(rows[0], given_by(run, name))]
-        for level in LEVELS:
-            best = sufficient(rows, bounds, level)
+        fastest_of = [sufficient(rows, bounds, level) for level in LEVELS]
+        cells = []
+        for level, best in zip(LEVELS, fastest_of, strict=True):
             missed = best is not None and median_error(best) > level
             cells.append((DASH if best is None else _latency(run, best)) + " †" * missed)
         least = chosen(rows, bounds)
         largest = least.error.rel_l2_max if least.error else inf
         cells.append(f"{_error(run, least)}; {_percent(largest)}")
-        body.append(cells)
+        shown = [row for row in (*fastest_of, least) if row is not None]
+        told = dict.fromkeys(class_text(row, given_by(run, name)) for row in shown)
+        body.append([f"`{method}`", "; or ".join(told), *cells])
     return markdown([*headings, "smallest median %; its max %"], body)
 
 
