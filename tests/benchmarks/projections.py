@@ -68,7 +68,7 @@ class Contender:
 def hyper(size: int) -> list[Contender]:
     """Return plain POD and its hyper-reduced forms with as many modes.
 
-    The tolerances of the cubatures are those of the quick sweeps. Interpolation has two force modes
+    The tolerances of the cubatures are those of the quick sweeps. Interpolation has four force modes
     for each displacement mode. `local-pod` with one cluster is POD with static correction.
     """
     forms: dict[str, tuple[str, Parameters]] = {
@@ -92,7 +92,7 @@ def hyper(size: int) -> list[Contender]:
             for name, (method, parameters) in cubatures.items()
         }
     for sampling in ("dofs", "cell-dofs", "cells"):
-        chosen = {"sampling": sampling, "n_force_modes": 2 * size}
+        chosen = {"sampling": sampling, "n_force_modes": 4 * size}
         forms[f"deim, {sampling}"] = "deim", chosen
         forms[f"deim, {sampling}, corrected"] = "deim", {**chosen, "static_correction": True}
     common = {"n_modes": size, "tolerance": TOLERANCE}
