@@ -68,8 +68,8 @@ class Contender:
 def hyper(size: int) -> list[Contender]:
     """Return plain POD and its hyper-reduced forms with as many modes.
 
-    The tolerances of the cubatures are those of the quick sweeps. Interpolation has four force modes
-    for each displacement mode. `local-pod` with one cluster is POD with static correction.
+    The tolerances of the cubatures are those of the quick sweeps. Interpolation has four force
+    modes for each displacement mode. `local-pod` with one cluster is POD with static correction.
     """
     forms: dict[str, tuple[str, Parameters]] = {
         "pod": ("pod", {}),
