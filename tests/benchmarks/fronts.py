@@ -124,14 +124,13 @@ def main(
         old = folder / "code"
         subprocess.run(["git", "worktree", "add", "--detach", old, commit], cwd=ROOT, check=True)
         try:
-            runs = {
+            of_both_versions = {
                 "before": (old, BEFORE),
                 "now": (ROOT, NOW),
                 "more": (ROOT, MORE),
                 "further": (ROOT, FURTHER),
             }
-            if newest:
-                runs = {"newest": (ROOT, NEWEST)}
+            runs = {"newest": (ROOT, NEWEST)} if newest else of_both_versions
             for name, (code, methods) in runs.items():
                 rows = found.get(name, [])
                 measured = {row["dataset"] for row in rows}
