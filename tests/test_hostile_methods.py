@@ -34,6 +34,7 @@ from mor_bench.snapshots.store import (
     read_shard,
     shard_bytes,
 )
+from tests.case_marks import nightly_but
 from tests.commands import invoke, mor_bench_command
 from tests.small_runs import method_file, run_small
 from tests.synthetic import a_row
@@ -124,7 +125,7 @@ class Mine(mor_bench.Surrogate):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("written", WRITTEN)
+@pytest.mark.parametrize("written", nightly_but(4, WRITTEN))
 def test_what_a_method_writes_to_its_result_pipe_costs_its_row(
     written: str, cache: Path, tmp_path: Path
 ) -> None:

@@ -179,7 +179,7 @@ def long_undisturbed(
 
 
 @needs_signals
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_generation_killed_fifty_times_and_resumed_is_bit_identical(
     tmp_path: Path, generators: Generators, long_undisturbed: dict[str, bytes]
 ) -> None:

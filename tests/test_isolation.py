@@ -23,6 +23,7 @@ from mor_bench.scratch import identity
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.generate import dataset_folder, generation_seconds
 from mor_bench.specs import load_generated_spec
+from tests.case_marks import nightly_but
 from tests.commands import mor_bench_command
 from tests.small_runs import PLAIN, method_file, run_small
 from tests.third_party import Peeker
@@ -305,7 +306,7 @@ def test_a_module_that_cannot_be_imported_costs_its_own_row(cache: Path, tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["syntax", "exit", "end", "odd-text", "abstract"])
+@pytest.mark.parametrize("how", nightly_but(2, ["syntax", "exit", "end", "odd-text", "abstract"]))
 @pytest.mark.parametrize("command", ["check", "fit"])
 def test_a_module_that_cannot_be_imported_is_one_line_of_check_and_fit(
     how: str, command: str, cache: Path, tmp_path: Path

@@ -28,6 +28,7 @@ from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
 from mor_bench.sandbox.seal import Restrictions
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
+from tests.case_marks import nightly_but
 from tests.intruder import WAYS
 from tests.small_runs import method_file
 
@@ -194,7 +195,7 @@ def test_a_process_that_never_releases_the_interpreter_ends_with_its_parent(tmp_
 @pytest.mark.slow
 @pytest.mark.skipif(landlock.version() < 6, reason="needs a kernel with Landlock")
 @pytest.mark.parametrize("sealed", [True, False])
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", nightly_but(3, WAYS))
 def test_the_kernel_keeps_a_method_out_of_sealed_folders(
     way: str, sealed: bool, server: ForkServer | None, tiny_scene: Scene, tmp_path: Path
 ) -> None:

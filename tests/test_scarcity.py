@@ -73,7 +73,12 @@ PLACES = {
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "free_bytes"),
-    [("out", 0), ("cache", 100_000), ("tmp", 0), ("both", DISK_BYTES // 100)],
+    [
+        ("cache", 100_000),
+        pytest.param("out", 0, marks=pytest.mark.nightly),
+        pytest.param("tmp", 0, marks=pytest.mark.nightly),
+        pytest.param("both", DISK_BYTES // 100, marks=pytest.mark.nightly),
+    ],
 )
 def test_a_run_on_a_full_disk_ends_with_one_line_and_goes_on_with_room(
     place: str, free_bytes: int, undisturbed: dict[str, str], tmp_path: Path
@@ -299,7 +304,7 @@ def test_a_jumping_clock_changes_no_row(
 
 
 @linux_only
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_jumping_clock_takes_nothing_from_a_training_that_resumes(
     jumping: dict[str, str], tmp_path: Path
 ) -> None:

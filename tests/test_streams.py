@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.case_marks import nightly_but
 from tests.small_runs import COMMAND
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
@@ -242,7 +243,7 @@ def first_word_s(line: str, folder: Path, file: Path) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", LARGE)
-@pytest.mark.parametrize("line", BEGUN)
+@pytest.mark.parametrize("line", nightly_but(2, BEGUN))
 def test_large_inputs_are_not_met_with_silence(what: str, line: str, tmp_path: Path) -> None:
     text = (ROOT / "datasets" / "beam-tiny.toml").read_text(encoding="utf-8")
     file = tmp_path / "large.toml"

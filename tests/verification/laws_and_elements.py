@@ -64,21 +64,21 @@ ISOTROPIC = [name for name in LAWS if name != "holzapfel-gasser-ogden"]
 EVERY = list(itertools.product(LAWS, ELEMENTS))
 
 
-def quick_first(pairs: Iterable[tuple[str, tuple[str, bool]]] = EVERY) -> list[ParameterSet]:
-    """Mark pairs as slow, except every element with one law and every law on one element.
+def when(law: str, kind: tuple[str, bool]) -> tuple[pytest.MarkDecorator, ...]:
+    """Return the marks of a pair: quick, slow or nightly.
 
-    The kernel of each pair is compiled on its own, which takes seconds.
+    The kernel of each pair is compiled on its own, which takes seconds. Quick are every element
+    with one law and every law on one element. Slow is each other law on one more element.
     """
-    return [
-        pytest.param(
-            law,
-            kind,
-            marks=()
-            if law == "saint-venant-kirchhoff" or kind == ELEMENTS[0]
-            else pytest.mark.slow,
-        )
-        for law, kind in pairs
-    ]
+    number, element = list(LAWS).index(law), ELEMENTS.index(kind)
+    if number == 0 or element == 0:
+        return ()
+    return (pytest.mark.slow if (number + element) % 3 == 0 else pytest.mark.nightly,)
+
+
+def quick_first(pairs: Iterable[tuple[str, tuple[str, bool]]] = EVERY) -> list[ParameterSet]:
+    """Mark the pairs of laws and elements as `when` does."""
+    return [pytest.param(law, kind, marks=when(law, kind)) for law, kind in pairs]
 
 
 def mesh_options(element: str) -> dict[str, Any]:

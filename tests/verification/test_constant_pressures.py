@@ -305,7 +305,7 @@ def test_reduced_cells_refuse_followers() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pressure", [SIDE, FOLLOWER])
+@pytest.mark.parametrize("pressure", [FOLLOWER, pytest.param(SIDE, marks=pytest.mark.nightly)])
 def test_a_run_answers_or_says_why_not(
     pressure: dict[str, Any], tmp_path: Path, cache: Path
 ) -> None:

@@ -266,8 +266,12 @@ def test_the_vectorised_kernel_is_the_general_one() -> None:
 
 
 def slow_unless(quick: Callable[..., bool], cases: Iterable[Any]) -> list[Any]:
-    """Mark cases as slow, except those that give quick feedback."""
-    return [pytest.param(*c, marks=() if quick(*c) else pytest.mark.slow) for c in cases]
+    """Mark every third case as slow and the others as nightly, except those for quick feedback."""
+    late = (pytest.mark.slow, pytest.mark.nightly, pytest.mark.nightly)
+    return [
+        pytest.param(*case, marks=() if quick(*case) else late[n % 3])
+        for n, case in enumerate(cases)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -310,7 +314,7 @@ def test_slender_beams_follow_the_elastica(slender: FullOrderModel, load: float)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("law", "kind"), list(itertools.product(ISOTROPIC, ELEMENTS[:2])))
+@pytest.mark.parametrize(("law", "kind"), quick_first(itertools.product(ISOTROPIC, ELEMENTS[:2])))
 def test_every_law_follows_the_elastica(law: str, kind: tuple[str, bool]) -> None:
     """Strains of a slender beam are small, so PL²/EI = 1 bends all laws alike."""
     model = cantilever([20.0, 1.0, 1.0], [160, 1, 6], 0.0, "selective" if kind[1] else "full", law)

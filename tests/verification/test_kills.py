@@ -20,7 +20,13 @@ def expected(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
-@pytest.mark.parametrize("name", SIGNALS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name == "SIGKILL" else pytest.param(name, marks=pytest.mark.nightly)
+        for name in SIGNALS
+    ],
+)
 @pytest.mark.parametrize(
     "kills", [pytest.param(1, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.nightly)]
 )

@@ -11,11 +11,12 @@ from mor_bench.errors import MissingDependencyError
 from mor_bench.runs.configurations import CORE_METHODS
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.linear_fem import LinearFEM
+from tests.case_marks import nightly_but
 from tests.verification.load import loaded, predict_often
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CORE_METHODS)
+@pytest.mark.parametrize("name", nightly_but(3, CORE_METHODS))
 def test_memory_stays_flat_and_answers_stay_the_same(name: str, tiny: Dataset) -> None:
     try:
         method = loaded(name, tiny)

@@ -194,7 +194,7 @@ REFUSE = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tool", [True, False])
+@pytest.mark.parametrize("tool", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_a_run_answers_or_says_why_not(tool: bool, tmp_path: Path, cache: Path) -> None:
     cells = {"shape": "box", "size_m": [1.0, 1.0, 0.5], "cells": [2, 2, 1]}
     scene = moved(tool, constant_pressures=[SIDE], geometry=cells)
