@@ -30,7 +30,7 @@ from mor_bench.surrogates.ecm import EmpiricalCubaturePOD
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.hyper_reduced import nodal, reduced_points
 from mor_bench.surrogates.pod import PODGalerkin
-from tests.verification.laws_and_elements import quick_first
+from tests.verification.laws_and_elements import EVERY, quick_first
 from tests.verification.scenes import scene_of, solved
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ def whole_mesh(scene: Scene, weights: Array, modes: Array) -> GalerkinProblem:
     )
 
 
-@pytest.mark.parametrize(("law", "kind"), quick_first())
+@pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_sums_over_points_equal_the_assembled_force_and_tangent(
     law: str, kind: tuple[str, bool]
 ) -> None:
@@ -83,7 +83,7 @@ def test_sums_over_points_equal_the_assembled_force_and_tangent(
     )
 
 
-@pytest.mark.parametrize(("law", "kind"), quick_first())
+@pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_the_check_for_inverted_cells_finds_the_det_f_of_the_force(
     law: str, kind: tuple[str, bool]
 ) -> None:

@@ -21,14 +21,11 @@ def expected(
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 @pytest.mark.parametrize(
-    "name",
+    ("name", "kills"),
     [
-        name if name == "SIGKILL" else pytest.param(name, marks=pytest.mark.nightly)
-        for name in SIGNALS
+        pytest.param("SIGKILL", 1, marks=pytest.mark.slow),
+        *(pytest.param(name, 5, marks=pytest.mark.nightly) for name in SIGNALS),
     ],
-)
-@pytest.mark.parametrize(
-    "kills", [pytest.param(1, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.nightly)]
 )
 def test_a_killed_command_leaves_nothing_and_ends_with_the_same_result(
     expected: Undisturbed, name: str, kills: int, tmp_path: Path
